@@ -12,6 +12,7 @@ from helpers import ADJOINTS, ARGS, SYSTEMS, central_difference
 from jax.flatten_util import ravel_pytree
 
 import dvi_jax as dvi
+from dvi_jax.integration import reversible
 
 FINAL = dvi.Save(final=True)
 EVERY_FOURTH = dvi.Save(every=4, final=True)
@@ -396,3 +397,27 @@ def test_round_trip_defect_is_that_of_reconstructed_states(form):
     damped = rebuilt(80, 5.0, every=80, save=FINAL, form=form)
     assert damped > 1e-14
     assert rebuilt(80, 5.0, every=10, save=FINAL, form=form) < damped / 10
+
+
+@pytest.mark.parametrize("number", [float, jnp.asarray, jnp.float32])
+def test_a_first_gradient_is_traced_once(number, monkeypatch):
+    """H_D once for its shape and once for each half of a step, with numbers of several types: that
+    of a number of Python is weak. And the reverse pass once."""
+    calls, passes = [], []
+    reverse_pass = reversible.ReversePass
+
+    def H_D(t0, t1, q0, p1, args):
+        calls.append(1)
+        return jnp.sum(p1**2) / 2 + args * jnp.sum(q0**4)
+
+    def loss(q):
+        run = dvi.integrate(
+            dvi.System(H_D), q, q, h=0.1, num_steps=10, args=number(0.3), throw=False
+        )
+        return run.qs[-1].sum()
+
+    monkeypatch.setattr(
+        reversible, "ReversePass", lambda *args: passes.append(1) or reverse_pass(*args)
+    )
+    jax.jit(jax.grad(loss)).lower(np.ones(60))
+    assert (len(calls), len(passes)) == (3, 1)

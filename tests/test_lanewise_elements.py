@@ -1,6 +1,8 @@
 """Array loops: which stores are left out, which arrays share memory, and what does not change."""
 
 import functools
+import resource
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -277,3 +279,26 @@ def test_updates_at_computed_places_come_one_after_the_other():
 
     x, k = jnp.sin(jnp.arange(1.0 * N)), jnp.array([7, 50, 7, 9, 7])
     np.testing.assert_allclose(lanewise.call(function, x, k), function(x, k), rtol=1e-13)
+
+
+_PAGES = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+
+
+@pytest.mark.skipif(
+    not _PAGES.exists() or "[never]" in _PAGES.read_text(), reason="no large pages on this machine"
+)
+def test_long_arrays_of_a_run_are_in_large_pages():
+    def function(x):
+        def step(state, _):
+            y, z = state
+            return (y + 0.1 * jnp.roll(z, 1), z - 0.1 * y), None
+
+        y = x * jnp.arange(2.0**21)
+        return sum(map(jnp.sum, jax.lax.scan(step, (y, -y), None, length=2)[0]))
+
+    f = jax.jit(lambda x: lanewise.call(function, x))
+    jax.block_until_ready(f(1.0))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    jax.block_until_ready(f(1.0))
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+    assert faults < 2**12  # two arrays of 16 MiB are 2¹³ pages of 4 KiB

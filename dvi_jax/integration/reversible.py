@@ -134,6 +134,7 @@ class Reversible(AbstractAdjoint):
             def push(*point_and_change):
                 return pair(*point_and_change)[1]
 
+            @jax.jit  # traced once, for its type and for its code
             def pull(variables, constants, counts, record, cotangent):
                 theta, q0, p0 = eqx.combine(variables, constants)
                 variable, constant = eqx.partition(theta, is_variable[0])

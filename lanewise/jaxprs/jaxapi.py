@@ -319,7 +319,9 @@ def _linear_batched(arrays, axes, *, functions: _Linear, count: int):
 def _linear_transposed(cotangents, *arrays, functions: _Linear, count: int):
     push, pull, definition, transposed = functions
     types = [x.aval if ad.is_undefined_primal(x) else jax.typeof(x) for x in arrays]
-    like = jax.eval_shape(push, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in types))
+    like = jax.eval_shape(
+        push, *(jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in types)
+    )
     vector = [
         jnp.zeros(a.shape, a.dtype) if isinstance(c, ad.Zero) else c
         for c, a in zip(cotangents, like, strict=True)
@@ -357,7 +359,7 @@ ad.primitive_jvps[_linear] = _linear_derivative
 
 
 def _abstract(function: Callable, avals: Any, params: dict[str, Any]) -> Any:
-    shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
+    shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in avals]
     shape_of = getattr(function, "shape_of", None)
     if shape_of is not None:
         out = shape_of(*shapes, **params)

@@ -28,8 +28,10 @@ class Trace:
             trees.append(out_tree)
             return out
 
-        # Traced for one device: its own constants need not vary along the axes of a mesh.
-        return cls(jax.make_jaxpr(flat)(*map(without_manual_axes, leaves)), trees[-1])
+        # Traced for one device: its own constants need not vary along the axes of a mesh. The mesh
+        # is named although it stays: JAX traces what is jitted once with a mesh and once without.
+        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+            return cls(jax.make_jaxpr(flat)(*map(without_manual_axes, leaves)), trees[-1])
 
     @functools.cached_property
     def outer(self) -> list[Any]:

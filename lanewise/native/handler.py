@@ -60,9 +60,10 @@ KERNEL = (
     "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:"
 )
 
-# Only Linux has `madvise`. Below 32 MiB the C library reuses memory that is mapped already, so that
-# the call would cost more time than it saves.
-_LARGE = 32 * 2**20 if sys.platform == "linux" else 2**63 - 1
+# Only Linux has `madvise`. Results below 32 MiB are memory that is mapped already: the C library
+# reuses it, and the call would cost more time than it saves. Scratch is read in every step.
+_LARGE_RESULT = 32 * 2**20 if sys.platform == "linux" else 2**63 - 1
+_LARGE_SCRATCH = 4 * 2**20 if sys.platform == "linux" else 2**63 - 1
 
 _NO_MEMORY = "not enough memory for the arrays of a compiled function"
 _EXHAUSTED = 8  # XLA_FFI_Error_Code_RESOURCE_EXHAUSTED
@@ -76,9 +77,9 @@ declare void @free(ptr)
 declare i32 @sched_yield()
 declare i32 @madvise(ptr, i64, i32)
 
-; Large results in large pages: at 4 KiB each, the first touch of new memory costs as much as steps.
-define internal void @large_pages(ptr %at, i64 %bytes) {{
-  %is.large = icmp uge i64 %bytes, {_LARGE}
+; Large arrays in large pages: at 4 KiB each, the first touch of new memory costs as much as steps.
+define internal void @large_pages(ptr %at, i64 %bytes, i64 %least) {{
+  %is.large = icmp uge i64 %bytes, %least
   br i1 %is.large, label %yes, label %no
 yes:
   %address = ptrtoint ptr %at to i64
@@ -145,6 +146,7 @@ define internal void @task(ptr %job) {{
   {addresses("job", "Job", "scratch")}
   %bytes = load i64, ptr %job.scratch
   %memory = call ptr @malloc(i64 %bytes)
+  call void @large_pages(ptr %memory, i64 %bytes, i64 {_LARGE_SCRATCH})
   %is.none = icmp eq ptr %memory, null
   br i1 %is.none, label %over, label %run      ; the caller has memory, and computes all
 run:
@@ -203,6 +205,7 @@ entry:
   ; Not from the stack: that of a thread of XLA's pool may be small.
   %memory.size = add i64 %scratch.size, 64
   %memory = call ptr @malloc(i64 %memory.size)
+  call void @large_pages(ptr %memory, i64 %memory.size, i64 {_LARGE_SCRATCH})
   %no.job = icmp eq ptr %job, null
   %no.memory = icmp eq ptr %memory, null
   %none.of = or i1 %no.job, %no.memory
@@ -236,7 +239,7 @@ one.result:
   %sizes.n = getelementptr i64, ptr %sizes, i64 %n
   %size.each = load i64, ptr %sizes.n
   %size.all = mul i64 %size.each, %lanes
-  call void @large_pages(ptr %result, i64 %size.all)
+  call void @large_pages(ptr %result, i64 %size.all, i64 {_LARGE_RESULT})
   %n.next = add i64 %n, 1
   br label %next.result
 ready.to.run:
