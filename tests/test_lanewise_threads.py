@@ -163,8 +163,16 @@ def test_a_sum_over_modes_stores_no_powers(modes):
     coefficients, shape = np.random.default_rng(1).normal(size=modes), _sums.Shape(5, 1)
     sums = jax.make_jaxpr(lambda *at: _sums.derivatives(coefficients, shape, *at, 2))
     function, flags = sums(0.1, 0.2, 0.3), [True] * 3
-    assert ptx_of(function, flags, 90).local_bytes == 0
+    kernel = ptx_of(function, flags, 90)
+    assert kernel.local_bytes == 0
     assert Numbers().write(function, flags, 64, None).scratch == 0
+    # Several arrays of constants are read in vectors.
+    assert (".v2." in kernel.text) == (modes[-1] == 4)
+    assert compared(function, flags, list(np.random.default_rng(2).random((3, 24))), 24) == 10
+    if ".v2." in kernel.text:
+        wrong = dataclasses.replace(kernel, text=kernel.text.replace(".align 16", ".align 8"))
+        with pytest.raises(AssertionError, match="multiple of the bytes"):
+            ptx_on_cpu.run(wrong, [np.ones(24)] * 3, [np.ones(24)] * 10, 24)
 
 
 # --- every rule, and random programs --------------------------------------------------------------
