@@ -66,9 +66,11 @@ class Module:
             numbers = ", ".join(
                 f"{item} {literal(x, stored_dtype)}" for x in array.astype(stored_dtype).reshape(-1)
             )
-            self.globals.append(
-                f"{name} = private unnamed_addr constant [{array.size} x {item}] [{numbers}]"
-            )
+            # LLVM reads a longer array in vectors of 16 bytes, but for GPUs declares the alignment
+            # of one number.
+            kind = f"[{array.size} x {item}]"
+            line = f"{name} = private unnamed_addr constant {kind} [{numbers}], align 16"
+            self.globals.append(line)
         name = self._constants[key]
         return Buffer((name,), dtype, array.shape, contiguous(array.shape), None)
 

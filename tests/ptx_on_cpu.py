@@ -2,7 +2,8 @@
 
 Only what LLVM writes for the kernels of `lanewise.targets.threads` is understood, and everything
 else is an error. A floating-point instruction that rounds must say ``.rn``: without it the
-assembler of a GPU may contract a product with a sum.
+assembler of a GPU may contract a product with a sum. An access must be aligned, as a GPU requires:
+arrays are placed where they have the alignment that PTX declares, and no larger one.
 """
 
 import ctypes
@@ -76,7 +77,9 @@ class Function:
     def text(self) -> str:
         parameters = ", ".join([*(f"i64 %{p}" for p in self.params), GRID])
         allocated = [f"  {self.place(r)} = alloca {kind}" for r, kind in self.registers.items()]
-        allocated += [f"  %{m} = alloca [{n} x i8], align 16" for m, n in self.memory.items()]
+        for m, (n, align) in self.memory.items():
+            allocated.append(f"  %{m}.0 = alloca [{n + align} x i8], align {2 * align}")
+            allocated.append(f"  %{m} = getelementptr i8, ptr %{m}.0, i64 {align}")
         head = f"define internal void @{self.name}({parameters}) {{\nentry:"
         return "\n".join([head, *allocated, *self.lines, "}\n"])
 
@@ -98,8 +101,8 @@ class Function:
     def declare(self, text: str) -> None:
         if match := re.fullmatch(r"\.reg \.(\w+) (%[A-Za-z]+)(?:<\d+>)?", text):
             self.kinds[match[2]] = integer_type(match[1])
-        elif match := re.fullmatch(r"\.local .*\.b8 (\w+)\[(\d+)\]", text):
-            self.memory[match[1]] = int(match[2])
+        elif match := re.fullmatch(r"\.local \.align (\d+) \.b8 (\w+)\[(\d+)\]", text):
+            self.memory[match[2]] = int(match[3]), int(match[1])
         else:
             assert text.startswith((".param ", ".pragma ")), text  # of a call; no instruction
 
@@ -130,8 +133,10 @@ class Function:
         if operand[:2] in ("0d", "0f"):
             return str(int(operand[2:], 16))
         if operand in self.memory or operand in self.module.data:
-            name = f"%{operand}" if operand in self.memory else f"@{operand}"
-            return self.new(f"ptrtoint ptr {name} to {kind}")
+            if operand in self.memory:
+                return self.new(f"ptrtoint ptr %{operand} to {kind}")
+            start = self.new(f"ptrtoint ptr @{operand} to {kind}")
+            return self.new(f"add {kind} {start}, {self.module.data[operand][0]}")
         number = int(operand.rstrip("U"), 0)
         return ("true" if number else "false") if kind == "i1" else str(number)
 
@@ -157,6 +162,9 @@ class Function:
     def pointers(self, text: str, size: int, count: int) -> list[str]:
         base, offset = self.address(text)
         start = self.read(base, "i64")
+        rest = self.new(f"urem i64 {self.new(f'add i64 {start}, {offset}')}, {size * count}")
+        total = self.new(f"or i64 {rest}, {self.new('load i64, ptr @misaligned')}")
+        self.emit(f"store i64 {total}, ptr @misaligned")
         ends = [self.new(f"add i64 {start}, {offset + size * i}") for i in range(count)]
         return [self.new(f"inttoptr i64 {end} to ptr") for end in ends]
 
@@ -432,14 +440,23 @@ class Translation:
     def __init__(self, text: str):
         self.declarations: set[str] = set()
         self.counts: Counter = Counter()
-        self.data: dict[str, str] = {}
+        self.data: dict[str, tuple[int, str]] = {}  # alignment, and text
         text = re.sub(r"//.*", "", text)
-        array = r"^\.(?:visible )?global .*?\.[bfu](\d+) (\w+)\[(\d+)\](?: = \{(.*?)\})?;"
-        for bits, name, size, numbers in re.findall(array, text, re.M | re.S):
+        array = (
+            r"^\.(?:visible )?global \.align (\d+) \.[bfu](\d+) (\w+)\[(\d+)\](?: = \{(.*?)\})?;"
+        )
+        for align, bits, name, size, numbers in re.findall(array, text, re.M | re.S):
             values = [int(re.sub("^0[df]", "0x", n.strip()), 0) for n in numbers.split(",") if n]
             values += [0] * (int(size) - len(values))  # zeros at the end are left out
             listed = ", ".join(f"i{bits} {n}" for n in values)
-            self.data[name] = f"@{name} = constant [{size} x i{bits}] [{listed}], align 16"
+            kinds, values = f"[{align} x i8]", f"[{size} x i{bits}]"
+            self.data[name] = (
+                int(align),
+                (
+                    f"@{name} = constant <{{{kinds}, {values}}}> "
+                    f"<{{{kinds} zeroinitializer, {values} [{listed}]}}>, align {2 * int(align)}"
+                ),
+            )
         pattern = r"^(?:\.visible )?\.(?:func|entry) +(\w+)\((.*?)\)[^{;]*\{(.*?)^\}"
         self.functions = {}
         for name, params, body in re.findall(pattern, text, re.M | re.S):
@@ -447,7 +464,14 @@ class Translation:
             self.functions[name] = Function(self, name, names, body)
         self.kernel = list(self.functions)[-1]
         bodies = [function.text for function in self.functions.values()]
-        parts = [*self.data.values(), *sorted(self.declarations), *bodies, self._launch()]
+        arrays = [declared for _, declared in self.data.values()]
+        parts = [
+            "@misaligned = global i64 0",
+            *arrays,
+            *sorted(self.declarations),
+            *bodies,
+            self._launch(),
+        ]
         self.text = "\n".join(parts)
 
     def _launch(self) -> str:
@@ -497,7 +521,14 @@ def launch_of(text: str) -> Any:
         engine = llvm.create_mcjit_compiler(module, host)
         engine.finalize_object()
         kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32)
-        launch = kind(engine.get_function_address("launch"))
+        run = kind(engine.get_function_address("launch"))
+        misaligned = ctypes.c_int64.from_address(engine.get_global_value_address("misaligned"))
+
+        def launch(*arguments: Any) -> None:
+            misaligned.value = 0
+            run(*arguments)
+            assert misaligned.value == 0, "an address is not a multiple of the bytes of its access"
+
         _launches[text] = engine, launch, translation.counts
     return _launches[text][1:]
 

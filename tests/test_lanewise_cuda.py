@@ -24,20 +24,23 @@ Handler = ctypes.CFUNCTYPE(P, P)
 Launch = ctypes.CFUNCTYPE(INT, P, *[ctypes.c_uint] * 7, P, ctypes.POINTER(P), P)
 NAMES = {
     1: b"CUDA_ERROR_INVALID_VALUE", 2: b"CUDA_ERROR_OUT_OF_MEMORY", 218: b"CUDA_ERROR_INVALID_PTX",
-    700: b"CUDA_ERROR_ILLEGAL_ADDRESS", 701: b"CUDA_ERROR_LAUNCH_OUT_OF_RESOURCES",
+    209: b"CUDA_ERROR_NO_BINARY_FOR_GPU", 700: b"CUDA_ERROR_ILLEGAL_ADDRESS",
+    701: b"CUDA_ERROR_LAUNCH_OUT_OF_RESOURCES",
 }  # fmt: skip
 
 
 class Library:
     """A substitute for libcuda.so.1, which runs PTX on the CPU."""
 
-    def __init__(self, text="", version=13_000, registers=68, local=0, devices=1, fails=()):
+    def __init__(self, text="", version=13_000, registers=68, local=0, fails=()):
         self.text, self.version, self.fails = text, version, dict(fails)
-        self.attributes, self.devices = {3: local, 4: registers}, devices
-        self.calls, self.launches = [], []
+        self.attributes, self.contexts, self.retained = {3: local, 4: registers}, [], []
+        self.calls, self.launches, self.loaded_on = [], [], []
         kinds = {
-            "cuInit": [ctypes.c_uint], "cuDriverGetVersion": [P], "cuDeviceGetCount": [P],
-            "cuDeviceGet": [P, INT], "cuGetErrorName": [INT, P],
+            "cuInit": [ctypes.c_uint], "cuDriverGetVersion": [P], "cuGetErrorName": [INT, P],
+            "cuDeviceGet": [P, INT], "cuDevicePrimaryCtxRetain": [P, INT],
+            "cuCtxPushCurrent_v2": [P], "cuKernelGetFunction": [P, P], "cuCtxPopCurrent_v2": [P],
+            "cuDevicePrimaryCtxRelease_v2": [INT],
             "cuLibraryLoadData": [P, ctypes.c_char_p, P, P, ctypes.c_uint, P, P, ctypes.c_uint],
             "cuLibraryGetKernel": [P, P, ctypes.c_char_p], "cuKernelGetAttribute": [P, INT, P, INT],
         }  # fmt: skip
@@ -64,13 +67,25 @@ class Library:
         elif name == "cuLibraryGetKernel":
             assert (args[1], args[2]) == (0x11B, b"lanewise_kernel")
             P.from_address(args[0]).value = KERNEL
-        else:
-            value = {"cuDriverGetVersion": self.version, "cuDeviceGetCount": self.devices}.get(name)
-            if name == "cuKernelGetAttribute":
-                assert args[2] == KERNEL
-                value = self.attributes[args[1]]
-            if name != "cuInit":
-                INT.from_address(args[0]).value = args[1] if value is None else value
+        elif name == "cuDriverGetVersion":
+            INT.from_address(args[0]).value = self.version
+        elif name == "cuDeviceGet":
+            INT.from_address(args[0]).value = 10 + args[1]  # a handle is no ordinal
+        elif name == "cuDevicePrimaryCtxRetain":
+            self.retained.append(args[1])
+            P.from_address(args[0]).value = 1000 + args[1]
+        elif name == "cuDevicePrimaryCtxRelease_v2":
+            self.retained.remove(args[0])
+        elif name == "cuCtxPushCurrent_v2":
+            self.contexts.append(args[0])
+        elif name == "cuCtxPopCurrent_v2":
+            P.from_address(args[0]).value = self.contexts.pop()
+        elif name == "cuKernelGetFunction":
+            assert args[1] == KERNEL
+            self.loaded_on.append(self.contexts[-1])
+        elif name == "cuKernelGetAttribute":
+            assert args[2] == KERNEL
+            INT.from_address(args[0]).value = self.attributes[args[1]] + args[3] - 10
         return 0
 
     def launch(self, kernel, *rest):
@@ -179,7 +194,7 @@ def test_a_handler_reports_its_version_and_that_it_may_be_recorded():
     run, _, _ = prepared(Library(), "of_metadata")
     keep = []
     meta = words("Metadata", keep)
-    extension = words("Metadata_Extension", keep, metadata=meta)
+    extension = words("Metadata_Extension", keep, metadata=meta, extension_base__type=1)
     frame = words("CallFrame", keep, extension_start=extension)
     assert run(frame) is None
     version = [ctypes.c_int32.from_address(meta + offset("Metadata", name)).value for name in
@@ -217,6 +232,19 @@ def test_an_error_of_the_launch_is_an_error_of_xla(code, name, kind):
     assert run(frame.address) is None  # the next call works
 
 
+def test_other_extensions_of_a_call_are_no_query():
+    """Control: taken for one, they would end the call without a launch and without an error."""
+    library = Library()
+    run, frame, _ = prepared(library, "of_extension")
+    keep = []
+    extension = words("Metadata_Extension", keep, extension_base__type=7)
+    ctypes.c_int64.from_address(
+        frame.address + offset("CallFrame", "extension_start")
+    ).value = extension
+    assert run(frame.address) is None
+    assert len(library.launches) == 1
+
+
 def test_an_error_of_the_stream_is_that_of_xla():
     library = Library()
     run, frame, _ = prepared(library, "of_stream", has_stream=False)
@@ -247,20 +275,24 @@ def test_xla_takes_a_handler_and_its_errors():
             r"cuLibraryLoadData: CUDA_ERROR_INVALID_PTX \(CUDA error 218\) line 7: no such thing",
         ),
         ({"fails": {"cuKernelGetAttribute": 2}}, "cuKernelGetAttribute: CUDA_ERROR_OUT_OF_MEMORY"),
+        ({"fails": {"cuKernelGetFunction": 209}}, "CUDA_ERROR_NO_BINARY_FOR_GPU"),
+        ({"fails": {"cuDevicePrimaryCtxRetain": 2}}, "Retain: CUDA_ERROR_OUT_OF_MEMORY"),
         ({"local": 2**14 + 8}, "bytes of local memory of a GPU thread must be at most 16384"),
     ],
 )
 def test_a_kernel_that_cannot_run_is_left_to_xla(installed, settings, reason):
-    installed(Library(**settings))
+    library = installed(Library(**settings))
     with pytest.raises(NotCompilable, match=reason):
-        cuda.register(ptx_of(FUNCTION, FLAGS, 90))
+        cuda.register(ptx_of(FUNCTION, FLAGS, 90), [0])
+    assert not library.contexts
+    assert not library.retained
 
 
 def test_without_a_driver_or_with_an_old_one_there_is_a_reason(installed, monkeypatch):
     library = installed(Library())
     del library.cuLibraryLoadData
     with pytest.raises(NotCompilable, match="no function cuLibraryLoadData: it is too old"):
-        cuda.register(ptx_of(FUNCTION, FLAGS, 90))
+        cuda.register(ptx_of(FUNCTION, FLAGS, 90), [0])
 
     def missing(name):
         raise OSError(f"{name}: cannot open shared object file")
@@ -268,12 +300,12 @@ def test_without_a_driver_or_with_an_old_one_there_is_a_reason(installed, monkey
     monkeypatch.setattr(cuda.ctypes, "CDLL", missing)
     cuda.driver.cache_clear()
     with pytest.raises(NotCompilable, match=r"there is no CUDA driver: libcuda.so.1: cannot open"):
-        cuda.register(ptx_of(FUNCTION, FLAGS, 90))
+        cuda.register(ptx_of(FUNCTION, FLAGS, 90), [0])
 
 
-@pytest.mark.parametrize(("registers", "threads"), [(68, 128), (168, 128), (255, 64)])
+@pytest.mark.parametrize(("registers", "threads"), [(67, 128), (166, 128), (167, 64), (253, 64)])
 def test_a_kernel_is_loaded_once_for_all_devices(installed, monkeypatch, registers, threads):
-    library, blocks = installed(Library(registers=registers, devices=3)), []
+    library, blocks = installed(Library(registers=registers)), []
     address_of = cuda.handler_address
 
     def recorded(name, handle, threads):
@@ -283,10 +315,23 @@ def test_a_kernel_is_loaded_once_for_all_devices(installed, monkeypatch, registe
     monkeypatch.setattr(cuda, "handler_address", recorded)
     monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda *args, **options: None)
     kernel = ptx_of(FUNCTION, FLAGS, 90)
-    assert cuda.register(kernel) == cuda.register(kernel)
+    assert cuda.register(kernel, [2, 0]) == cuda.register(kernel, [2, 0])
     assert blocks == [threads]
     assert library.calls.count("cuLibraryLoadData") == 1
-    assert library.calls.count("cuKernelGetAttribute") == 6
+    # In the context of each device that JAX uses, and of no other; of the driver's three here.
+    assert library.loaded_on == [1012, 1010]
+    assert not library.contexts
+    assert not library.retained
+
+
+def test_a_grid_that_is_too_large_is_refused():
+    """Not computed in part: 2³² blocks would become none in 32 bits."""
+    library = Library(fails={"cuLaunchKernel": 1})
+    run, frame, _ = prepared(library, "of_large")
+    frame.params[0] = 2**38
+    assert run(frame.address) == ERROR
+    assert library.launches[0][1] == 2**32 - 1
+    assert "CUDA_ERROR_INVALID_VALUE" in frame.errors[0][0]
 
 
 IMPORT = """

@@ -21,13 +21,14 @@ from jax import export, lax
 
 import dvi_jax as dvi
 import lanewise
+from dvi_jax.systems.boozer import _sums
 from lanewise import primitive
 from lanewise.evaluator import RULES
 from lanewise.jaxprs import jaxapi
 from lanewise.jaxprs.extent import primitives_in
 from lanewise.llvm import ptx
 from lanewise.llvm.ir import NotCompilable
-from lanewise.native import machine
+from lanewise.native import cuda, machine
 from lanewise.rules import exact
 from lanewise.targets import TARGETS, threads
 from lanewise.targets.numbers import Numbers
@@ -154,6 +155,24 @@ def test_programs_have_the_bits_of_the_cpu(name):
         found = by_threads(call.function, call.lane_flags, call.operands, LANES)
         assert all(np.all(np.isfinite(x)) for x in call.results if x.dtype.kind == "f")
         assert_same_bits(found, call.results)
+
+
+@pytest.mark.parametrize("modes", [(1, 6, 7, 4), (2, 9, 21, 5)])
+def test_a_sum_over_modes_stores_no_powers(modes):
+    """Neither on a GPU nor on a CPU: the loops over modes carry them."""
+    coefficients, shape = np.random.default_rng(1).normal(size=modes), _sums.Shape(5, 1)
+    sums = jax.make_jaxpr(lambda *at: _sums.derivatives(coefficients, shape, *at, 2))
+    function, flags = sums(0.1, 0.2, 0.3), [True] * 3
+    kernel = ptx_of(function, flags, 90)
+    assert kernel.local_bytes == 0
+    assert Numbers().write(function, flags, 64, None).scratch == 0
+    # Several arrays of constants are read in vectors.
+    assert (".v2." in kernel.text) == (modes[-1] == 4)
+    assert compared(function, flags, list(np.random.default_rng(2).random((3, 24))), 24) == 10
+    if ".v2." in kernel.text:
+        wrong = dataclasses.replace(kernel, text=kernel.text.replace(".align 16", ".align 8"))
+        with pytest.raises(AssertionError, match="multiple of the bytes"):
+            ptx_on_cpu.run(wrong, [np.ones(24)] * 3, [np.ones(24)] * 10, 24)
 
 
 # --- every rule, and random programs --------------------------------------------------------------
@@ -483,6 +502,11 @@ REFUSED = {
         jnp.zeros(64),
         "arrays of a loop are too long for a GPU thread",
     ),
+    "parameters": (
+        lambda x: sum(jnp.sum(row) for row in x),
+        [jnp.zeros(1)] * 511,
+        "the number of parameters of a GPU kernel must be at most 512",
+    ),
     "complex": (lambda x: jnp.abs(x + 1j), 1.0, "float64, float32, bool or integers"),
     "no rule": (lambda x: jnp.fft.rfft(x).real, jnp.zeros(4), "no rule|must be float64"),
 }
@@ -491,8 +515,9 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_stays_with_xla(name):
     function, x, reason = REFUSED[name]
+    leaves, tree = jax.tree.flatten(x)
     with pytest.raises(NotCompilable, match=reason):
-        kernel_of(function, x)
+        kernel_of(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), *leaves)
     (part,) = lanewise.explain(function, x, device="cuda").parts
     assert re.search(reason, part.reason)
     assert str(part).startswith("left to XLA: ")
@@ -570,6 +595,20 @@ def test_the_oldest_gpu_decides(monkeypatch):
     monkeypatch.setattr(threads.jax, "devices", lambda *_: [new])
     (part,) = lanewise.explain(jnp.sin, 1.0, device="cuda:0").parts
     assert part.architecture == 120
+
+
+def test_a_kernel_is_loaded_on_the_gpus_of_this_process(monkeypatch):
+    """The driver may also have one that JAX does not use, and for which the code is too new."""
+    gpus = [
+        SimpleNamespace(compute_capability="9.0", process_index=i % 2, local_hardware_id=i)
+        for i in (0, 1, 4)
+    ]
+    monkeypatch.setattr(threads.jax, "devices", lambda *_: gpus)
+    loads = []
+    monkeypatch.setattr(cuda, "register", lambda kernel, numbers: loads.append(numbers))
+    closed = jax.make_jaxpr(jnp.sin)(1.0)
+    Threads().register(Threads().write(closed, [True], 1, None))
+    assert loads == [[0, 4]]
 
 
 SWITCHES = """

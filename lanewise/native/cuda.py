@@ -8,6 +8,7 @@ of the runtime. A kernel is loaded when a program is lowered, never in a handler
 
 import ctypes
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import jax.ffi
@@ -119,7 +120,9 @@ go:
   %lanes.up = add i64 %lanes, %threads
   %lanes.less = sub i64 %lanes.up, 1
   %blocks.64 = udiv i64 %lanes.less, %threads
-  %blocks = trunc i64 %blocks.64 to i32
+  %are.many = icmp ugt i64 %blocks.64, 4294967295
+  %blocks.most = select i1 %are.many, i64 4294967295, i64 %blocks.64  ; the driver refuses it
+  %blocks = trunc i64 %blocks.most to i32
   %block = trunc i64 %threads to i32
   %launch = load ptr, ptr @lanewise_cuda_launch
   %code = call i32 %launch(ptr %kernel, i32 %blocks, i32 1, i32 1, i32 %block, i32 1, i32 1,
@@ -222,18 +225,28 @@ class Driver:
         assert kernel.value is not None
         return kernel.value
 
-    def largest(self, attribute: int, kernel: int) -> int:
-        """The largest value of an attribute on all devices, on which the kernel is then loaded."""
-        count, device, value = ctypes.c_int(), ctypes.c_int(), ctypes.c_int()
-        self.call("cuDeviceGetCount", ctypes.byref(count))
-        values = []
-        for i in range(count.value):
-            # Loaded on each device now: a load in a handler could fall into the record of a graph.
-            self.call("cuDeviceGet", ctypes.byref(device), i)
-            handle = ctypes.c_void_p(kernel)
-            self.call("cuKernelGetAttribute", ctypes.byref(value), attribute, handle, device)
-            values.append(value.value)
-        return max(values, default=0)
+    def largest(self, kernel: int, devices: Sequence[int]) -> tuple[int, int]:
+        """The largest (registers, bytes of local memory) of a thread on these devices, on which the
+        kernel is then loaded."""
+        pairs = [self._prepare(ctypes.c_void_p(kernel), number) for number in devices]
+        return max(registers for registers, _ in pairs), max(local for _, local in pairs)
+
+    def _prepare(self, kernel: Any, number: int) -> tuple[int, int]:
+        device, context, function = ctypes.c_int(), ctypes.c_void_p(), ctypes.c_void_p()
+        self.call("cuDeviceGet", ctypes.byref(device), number)
+        # The context that XLA uses as well. The kernel is loaded there now: the driver would do so
+        # at the first launch, which may fall into the record of a graph.
+        self.call("cuDevicePrimaryCtxRetain", ctypes.byref(context), device)
+        self.call("cuCtxPushCurrent_v2", context)
+        try:
+            self.call("cuKernelGetFunction", ctypes.byref(function), kernel)
+        finally:
+            self.call("cuCtxPopCurrent_v2", ctypes.byref(context))
+            self.call("cuDevicePrimaryCtxRelease_v2", device)
+        values = ctypes.c_int(), ctypes.c_int()
+        for value, attribute in zip(values, (_REGISTERS, _LOCAL_BYTES), strict=True):
+            self.call("cuKernelGetAttribute", ctypes.byref(value), attribute, kernel, device)
+        return values[0].value, values[1].value
 
 
 @machine.once
@@ -251,8 +264,8 @@ def name_of(kernel: PtxKernel) -> str:
     return f"lanewise_cuda_{cache.key(kernel.text)[:32]}"
 
 
-def register(kernel: PtxKernel) -> str:
-    """The same, and the kernel is loaded and registered if it was not.
+def register(kernel: PtxKernel, devices: Sequence[int]) -> str:
+    """The same, and the kernel is loaded on these devices and registered if it was not.
 
     **Raises** `NotCompilable` with the reason if the driver does not take it.
     """
@@ -261,9 +274,9 @@ def register(kernel: PtxKernel) -> str:
         if name not in _names:
             handle = driver().load(kernel.text, kernel.name)
             # Only the driver knows how many registers it uses, and what it moves to memory.
-            local = driver().largest(_LOCAL_BYTES, handle)
+            registers, local = driver().largest(handle, devices)
             check_size(local, MOST_LOCAL_BYTES, "bytes of local memory of a GPU thread")
-            threads = min(threads_for(driver().largest(_REGISTERS, handle)), kernel.threads)
+            threads = min(threads_for(registers), kernel.threads)
             address = handler_address(name, handle, threads)
             jax.ffi.register_ffi_target(name, capsule(address), platform="CUDA")
             _names.add(name)

@@ -21,6 +21,8 @@ from .structures import addresses, offset, size
 API_MAJOR, API_MINOR = 0, 1
 """The version of XLA's interface that the structures are of; newer ones of 0 keep them."""
 
+_METADATA = 1  # XLA_FFI_Extension_Metadata
+
 
 def handler_text(name: str, call: str, traits: int = 0) -> str:
     """The text of a handler: `call` are the instructions that compute `%r` from `%frame`; `traits`
@@ -30,7 +32,12 @@ define ptr @{name}(ptr %frame) {{
   %ext.at = getelementptr i8, ptr %frame, i64 {offset("CallFrame", "extension_start")}
   %ext = load ptr, ptr %ext.at
   %is.call = icmp eq ptr %ext, null
-  br i1 %is.call, label %call, label %version
+  br i1 %is.call, label %call, label %extended
+extended:
+  %type.at = getelementptr i8, ptr %ext, i64 {offset("Metadata_Extension", "extension_base.type")}
+  %type = load i32, ptr %type.at
+  %is.query = icmp eq i32 %type, {_METADATA}
+  br i1 %is.query, label %version, label %call ; a call may have other extensions
 version:                                     ; XLA queries the version of the interface
   %meta.at = getelementptr i8, ptr %ext, i64 {offset("Metadata_Extension", "metadata")}
   %meta = load ptr, ptr %meta.at

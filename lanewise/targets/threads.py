@@ -34,6 +34,9 @@ NAME = "lanewise_kernel"
 MOST_OPERATIONS = 8_000
 """Longer programs leave the caches of instructions, and their numbers the registers."""
 
+MOST_PARAMETERS = 512
+"""Of 8 bytes each: 4 KiB. Only newer drivers take more."""
+
 SHORT_LOOP = 8
 """Loops of at most so many rounds are unrolled."""
 
@@ -180,6 +183,8 @@ class Threads:
         module = ThreadModule()
         text = function_text(module, function, lane_flags)
         pointers = len(jaxpr.invars), len(jaxpr.outvars)
+        parameters = sum(pointers) + 1 + len(module.values)
+        check_size(parameters, MOST_PARAMETERS, "the number of parameters of a GPU kernel")
         text += kernel_text(module, *pointers)
         values, operations = tuple(module.values), module.b.operations
         scratch = module.scratch_bytes
@@ -189,7 +194,8 @@ class Threads:
         if self.architecture is not None:
             return self.architecture
         # Code for the oldest one runs on all of them.
-        capability = min(capabilities(), default=min(ARCHITECTURES))
+        capabilities = (round(10 * float(gpu.compute_capability)) for gpu in gpus())
+        capability = min(capabilities, default=min(ARCHITECTURES))
         architecture = architecture_for(capability)
         check_that(architecture is not None, f"the GPU is too old: sm_{capability}, not sm_80")
         assert architecture is not None
@@ -208,20 +214,21 @@ class Threads:
         from ..native import cuda
 
         # Without a GPU a program is lowered for another machine, and not run.
-        kernel = self.kernel(code)
-        return cuda.register(kernel) if capabilities() else cuda.name_of(kernel)
+        kernel, own = self.kernel(code), jax.process_index()
+        # Those that JAX uses: the driver may have others, which are too old, say.
+        numbers = [gpu.local_hardware_id for gpu in gpus() if gpu.process_index == own]
+        return cuda.register(kernel, numbers) if numbers else cuda.name_of(kernel)
 
     def assembly(self, code: Code) -> str:
         return self.kernel(code).text
 
 
-def capabilities() -> list[int]:
-    """Ten times the compute capabilities of the GPUs of this process."""
+def gpus() -> list[Any]:
+    """The NVIDIA GPUs of JAX, also those of other processes."""
     try:
-        devices = jax.devices("cuda")
+        return jax.devices("cuda")
     except RuntimeError:  # code is made for another machine
         return []
-    return [round(10 * float(device.compute_capability)) for device in devices]
 
 
 def ptx_of(function: ClosedJaxpr, lane_flags: Sequence[bool], architecture: int) -> PtxKernel:

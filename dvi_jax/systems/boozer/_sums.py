@@ -10,10 +10,12 @@ and y, and so smooth on the axis.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
@@ -65,26 +67,17 @@ def _polynomials(c: Float[Array, " d"], s: Any, order: int) -> list[Any]:
     return [0.0 if v is None else v for v in value]
 
 
-def _powers(first: Complex, factor: Complex, count: int) -> Complex:
-    """first · factor^k for k = 0 … count − 1, in arrays with k first."""
-    _, powers = lax.scan(lambda power, _: (_times(power, factor), power), first, None, length=count)
-    return powers
-
-
-def _shift(number: Complex) -> Complex:
-    """(0, a_0, a_1, …) without the last entry."""
-    real, imaginary = (jnp.concatenate([jnp.zeros_like(part[:1]), part[:-1]]) for part in number)
-    return real, imaginary
-
-
-# In both loops only sums are carried. Powers are computed before: a loop can be transposed, for
-# derivatives with respect to `c`, only if all that it carries is linear in `c`.
-def _over_k(c: Any, s: Any, phases: Complex, n: Any, order: int) -> tuple[Complex, ...]:
-    """A_m and its derivatives up to `order`, in the order of `derivatives`."""
+# Both loops carry powers next to the sums: arrays of powers would not fit into the registers.
+def _over_k(
+    c: Any, s: Any, first: Complex, factor: Complex, n_of: Callable, order: int
+) -> tuple[Complex, ...]:
+    """A_m and its derivatives up to `order`, in the order of `derivatives`; the phases of the terms
+    are first · factor^j, their n is n_of(k)."""
     zero = jnp.zeros_like(s)
 
-    def add(sums, row):
-        c_k, phase, n = row
+    def add(carry, row):
+        (sums, phase), (c_k, k) = carry, row
+        n = n_of(k)
         real = _polynomials(c_k[0], s, order)
         terms = [_scale(value, phase) for value in real]
         if c_k.shape[0] == 2:
@@ -95,11 +88,14 @@ def _over_k(c: Any, s: Any, phases: Complex, n: Any, order: int) -> tuple[Comple
             terms += [_rotate(n, term) for term in terms[:order]]
         if order == 2:
             terms.append(_rotate(n, terms[3]))
-        return tuple(_plus(*pair) for pair in zip(sums, terms, strict=True)), None
+        sums = tuple(_plus(*pair) for pair in zip(sums, terms, strict=True))
+        return (sums, _times(phase, factor)), None
 
     start = tuple((zero, zero) for _ in range((1, 3, 6)[order]))
     # The same loop on all devices, so that a GPU computes the same bits.
-    return lax.scan(add, start, (jnp.swapaxes(c, 0, 1), phases, n))[0]
+    count = c.shape[0]
+    k = np.arange(count, dtype=s.dtype) - count // 2
+    return lax.scan(add, (start, first), (c, k))[0][0]
 
 
 # Jitted, so that all calls in a step share one trace.
@@ -110,15 +106,13 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
     s, w, (N, h) = x * x + y * y, (x, y), shape
     _, M, K2, _ = c.shape  # M + 1, 2K + 1
     unit, zero = jnp.ones_like(s), jnp.zeros_like(s)
-    k = jnp.arange(K2, dtype=s.dtype) - K2 // 2
-    phases = _powers(_phase(-N * (K2 // 2) * zeta), _phase(N * zeta), K2)
-    power = _powers((unit, zero), w, M)
-    down_one = _shift(power)
-    of_m = _powers((unit, zero), _phase(N * h * zeta), M) if h else None
+    lowest, factor = _phase(-N * (K2 // 2) * zeta), _phase(N * zeta)
+    helix = _phase(N * h * zeta) if h else None
 
-    def add(sums, row):
-        c_m, m, w0, w1, w2, turn = row
-        A, *tail = _over_k(c_m, s, phases, N * (k + h * m), order)
+    def add(carry, row):
+        (sums, w0, w1, w2, turn), (c_m, m) = carry, row  # w^m, w^{m−1}, w^{m−2}
+        A, *tail = _over_k(c_m, s, lowest, factor, lambda k: N * (k + h * m), order)
+        following = _times(w0, w), w0, w1, turn and _times(turn, helix)
         if h:
             A, *tail = (_times(turn, a) for a in (A, *tail))
         terms = [_times(w0, A)[0]]
@@ -135,11 +129,15 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
             down_twice = _scale(m * (m - 1), w2)
             terms += [_times(w0, A_ss)[0], *_times(lower, A_s), *_times(down_twice, A)]
             terms += [_times(w0, A_szeta)[0], *_times(lower, A_zeta), _times(w0, A_zetazeta)[0]]
-        return tuple(a + b for a, b in zip(sums, terms, strict=True)), None
+        sums = tuple(a + b for a, b in zip(sums, terms, strict=True))
+        return (sums, *following), None
 
-    start = tuple(zero for _ in range((1, 5, 14)[order]))
-    rows = jnp.arange(M, dtype=s.dtype), power, down_one, _shift(down_one), of_m
-    B, *tail = lax.scan(add, start, (jnp.swapaxes(c, 0, 1), *rows))[0]
+    one, none = (unit, zero), (zero, zero)
+    sums = tuple(zero for _ in range((1, 5, 14)[order]))
+    start = sums, one, none, none, one if h else None
+    # In the order of the loops, so that no row is copied.
+    rows = jnp.transpose(c, (1, 2, 0, 3)), np.arange(M, dtype=s.dtype)
+    (B, *tail), *_ = lax.scan(add, start, rows)[0]
     if order == 0:
         return (B,)
     S, Tr, Ti, Z, *tail = tail
