@@ -286,6 +286,7 @@ def test_the_tune_of_a_rolled_magnet_is_that_of_the_same_magnet_described_otherw
         np.testing.assert_allclose(getattr(rolled, name), getattr(wanted, name), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_tunes_of_a_ring_with_vertical_bends():
     """A bend without focusing by its field is a quadrupole in its own plane."""
     at = pytest.importorskip("at")
@@ -303,6 +304,7 @@ def test_the_tunes_of_a_ring_with_vertical_bends():
     np.testing.assert_allclose(rings.optics(loaded).tune, upright[::-1], atol=1e-2)
 
 
+@pytest.mark.slow
 def test_what_is_perturbed_is_part_of_each_result_at_epsilon():
     """The voltage decides whether the motion is 6D, the lengths give s and the compaction."""
     ring = cell(angle=0.1, voltage=1e-3)
