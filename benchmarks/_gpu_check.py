@@ -5,6 +5,7 @@
 """
 
 import ctypes
+import functools
 import json
 import os
 import re
@@ -326,6 +327,11 @@ def stage_time(folder):
     for lanes in (1, 1_000, 10_000, 100_000):
         attempt(f"kepler, {lanes} trajectories, steps/s", lambda n=lanes: (
             f"{n * 10_000 / seconds_of(kepler, n, 10_000, 'auto'):.3g}"))  # fmt: skip
+    # Rows of a trajectory lie next to each other in memory: docs/gpu.md predicts what that costs.
+    for every in (1, 2, 3, 5):
+        saved, steps = functools.partial(kepler_saved, every=every), 100 * every
+        attempt(f"kepler, saved every {every} steps, steps/s", lambda saved=saved, steps=steps: (
+            f"{10**6 * steps / seconds_of(saved, 10**6, steps, 'auto'):.3g}"))  # fmt: skip
     return all(statuses)
 
 

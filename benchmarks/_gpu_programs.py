@@ -33,8 +33,8 @@ def kepler(lanes, steps, layout, save=None, dtype=float):
     return one, (q.astype(dtype), p.astype(dtype))
 
 
-def kepler_saved(lanes, steps, layout):
-    return kepler(lanes, steps, layout, dvi.Save(every=10))
+def kepler_saved(lanes, steps, layout, every=10):
+    return kepler(lanes, steps, layout, dvi.Save(every=every))
 
 
 def kepler_float32(lanes, steps, layout):
