@@ -236,8 +236,21 @@ def test_only_some_bodies(state):
     W = force_on(force, state)
     assert np.all(W[:2] == 0)
     assert np.any(W[2] != 0)
-    with pytest.raises(ValueError, match="on_bodies"):
-        force_on(forces.Radiation(0.1, LIGHT, on_bodies=(3,)), state)
+    for i in (0, 3):
+        with pytest.raises(ValueError, match="each of on_bodies must be one of 1, 2"):
+            force_on(forces.Radiation(0.1, LIGHT, on_bodies=(i,)), state)
+    plane = tuple(x[:, :2] for x in state)
+    for name, text in {
+        "harmonics": "pole of Harm",
+        "rotation": "momentum",
+        "disk": "pole of Gal",
+    }.items():
+        with pytest.raises(ValueError, match=text):
+            force_on(EVERY[name], plane)
+    for name in ("tides", "radiation", "damping", "outgassing"):
+        assert force_on(EVERY[name], plane).shape == (3, 2)
+    with pytest.raises(ValueError, match="mu"):
+        EVERY["relativity"](0.0, 0.1, jnp.asarray(R), jnp.asarray(V), {})
     with pytest.raises(ValueError, match="degree"):
         forces.Harmonics(1.0, {1: 0.1})
     with pytest.raises(ValueError, match="order"):

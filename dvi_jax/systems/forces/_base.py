@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ...base.checks import instance, whole
+from ...base.checks import array, instance, one_of, whole
 from ...base.types import Args, Scalar, State
 from ...problem.flows import value_of
 from ...problem.system import System
-from .._problem import Problem
+from .._problem import Problem, parameter
 from ..n_body import masses_of
 
 
@@ -29,14 +29,21 @@ class Bodies(NamedTuple):
 def bodies_of(q: State, p: State, args: Args) -> Bodies:
     """The bodies of a state. G is in the masses: they are G m [length³/time²]."""
     if q.ndim == 1:  # a satellite: a body without mass, and the centre at the origin
-        masses = jnp.asarray([args["mu"], 0.0], q.dtype)
+        masses = jnp.asarray([parameter(args, "mu"), 0.0], q.dtype)
         x, v = (jnp.stack([jnp.zeros_like(x), x]) for x in (q, p))
         return Bodies(x, v, masses, jnp.ones_like(masses))
-    masses = jnp.asarray(args["masses"], q.dtype)
+    masses = jnp.asarray(parameter(args, "masses"), q.dtype)
     tests = (0, len(q) - len(masses))
     masses_of(q[: len(masses)], args)
     scale = jnp.pad(masses, tests, constant_values=1.0)
     return Bodies(q, p / scale[:, None], args.get("G", 1.0) * jnp.pad(masses, tests), scale)
+
+
+def vector(name: str, value: Any, args: Args, like: Array) -> Array:
+    """The value of a parameter that is a vector, for each row of `like`. **Raises** `ValueError`
+    for another shape."""
+    value = value_of(value, args, like)
+    return jnp.broadcast_to(array(name, value, like.shape[-1:])[None], like.shape)
 
 
 class Force(eqx.Module):
@@ -134,8 +141,9 @@ class Central(Force):
 
     def accelerations(self, t, bodies, args):
         count, c = len(bodies.x), whole("centre", self.centre, 0, len(bodies.x) - 1)
-        others = self.on_bodies or [i for i in range(count) if i != c]
-        others = np.array([whole("each of on_bodies", i, 0, count - 1) for i in others])
+        all_others = [i for i in range(count) if i != c]
+        chosen = all_others if self.on_bodies is None else self.on_bodies
+        others = np.array([one_of("each of on_bodies", i, all_others) for i in chosen])
         r, v = (x[others] - x[c][None] for x in (bodies.x, bodies.v))
         masses = bodies.masses[others]
         a = self.relative(t, r, v, bodies.masses[c], masses, args)

@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -116,7 +117,7 @@ class Drag(Central):
     def relative(self, t, r, v, mu, masses, args):
         rate = value_of(self.rate, args, r)
         wind = jnp.zeros_like(r).at[:, 0].set(-rate * r[:, 1]).at[:, 1].set(rate * r[:, 0])
-        rho = jnp.stack([jnp.asarray(self.density(x, args), r.dtype) for x in r])[:, None]
+        rho = jax.vmap(lambda r: jnp.asarray(self.density(r, args), r.dtype))(r)[:, None]
         w = v - wind
         speed = jnp.sqrt(jnp.sum(w * w, -1, keepdims=True))
         return -value_of(self.ballistic, args, r) / 2 * rho * speed * w

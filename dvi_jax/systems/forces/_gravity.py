@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ...base.checks import function, whole
 from ...problem.flows import value_of
-from ._base import Central, bodies_of
+from ._base import Central, bodies_of, vector
 
 
 class Harmonics(Central):
@@ -61,7 +61,7 @@ class Harmonics(Central):
 
     def _axes(self, t: Any, r: Array, args: Any) -> Array:
         """The axes of the body, as rows."""
-        pole = value_of(self.pole, args, r)
+        pole = vector("pole of Harmonics", self.pole, args, r)[0]
         z = pole / jnp.sqrt(jnp.sum(pole * pole))
         level = jnp.sqrt(z[0] * z[0] + z[1] * z[1])
         is_up = level == 0
@@ -131,7 +131,7 @@ class ThirdBody(Central):
         function("path of ThirdBody", self.path, "(t, args)")
 
     def relative(self, t, r, v, mu, masses, args):
-        d = jnp.broadcast_to(jnp.asarray(self.path(t, args), r.dtype), r.shape)
+        d = vector("the value of path of ThirdBody", self.path(t, args), args, r)
         x = jnp.sum(r * (r - 2 * d), -1, keepdims=True) / jnp.sum(d * d, -1, keepdims=True)
         difference = x * (3 + x * (3 + x)) / (1 + (1 + x) * jnp.sqrt(1 + x))
         apart = jnp.sqrt(jnp.sum((r - d) ** 2, -1, keepdims=True))
@@ -152,8 +152,8 @@ class GalacticTide(Central):
     has_recoil: ClassVar[bool] = False
 
     def relative(self, t, r, v, mu, masses, args):
-        pole = value_of(self.pole, args, r)
-        n = jnp.broadcast_to(pole / jnp.sqrt(jnp.sum(pole * pole)), r.shape)
+        pole = vector("pole of GalacticTide", self.pole, args, r)
+        n = pole / jnp.sqrt(jnp.sum(pole * pole, -1, keepdims=True))
         return -value_of(self.strength, args, r) * jnp.sum(r * n, -1, keepdims=True) * n
 
 
@@ -216,7 +216,7 @@ class LenseThirring(Central):
     has_recoil: ClassVar[bool] = False
 
     def relative(self, t, r, v, mu, masses, args):
-        J = jnp.broadcast_to(value_of(self.momentum, args, r), r.shape)
+        J = vector("momentum of LenseThirring", self.momentum, args, r)
         r2 = jnp.sum(r * r, -1, keepdims=True)
         along = 3 * jnp.sum(J * r, -1, keepdims=True) / r2 * r
         return 2 / (value_of(self.c, args, r) ** 2 * r2**1.5) * jnp.cross(along - J, v)
