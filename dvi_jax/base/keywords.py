@@ -145,9 +145,13 @@ def _explained(function: Callable[..., Any], name: str, signature: Any) -> Calla
     settings = getattr(checks.settings_type(function), "__annotations__", {})
     kinds = {**function.__annotations__, **settings}
     flags = {argument for argument, kind in kinds.items() if kind is bool}
+    # Others may compile; a result can be read and drawn in any process.
+    only_reads = function.__module__.startswith(("dvi_jax.plot", "dvi_jax.sweep"))
 
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
+        if signature is function and not only_reads:
+            refuse_fork()
         # Text such as "no" would count as True.
         for flag in flags & keywords.keys():
             checks.instance(flag, keywords[flag], bool | np.bool_, "True or False")
