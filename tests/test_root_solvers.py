@@ -13,10 +13,11 @@ import dvi_jax as dvi
 import lanewise
 from dvi_jax import systems
 from dvi_jax.base.types import Interval
-from dvi_jax.engine.newton import Newton, find_root, relative_size
+from dvi_jax.engine.newton import NestedNewton, Newton, find_root, relative_size
 from dvi_jax.engine.picard import Picard, PicardThenNewton
 from dvi_jax.engine.simplified import SimplifiedNewton, factorise
 from dvi_jax.methods.step import Equations, no_step_yet
+from lanewise.jaxprs.extent import operation_count
 
 EPS = np.finfo(float).eps
 MANY = PicardThenNewton(newton_up_to=0)
@@ -546,3 +547,35 @@ def test_settings_that_cannot_work_are_rejected():
         PicardThenNewton(newton_up_to=-1)
     with pytest.raises(TypeError, match="picard must be a dvi"):
         PicardThenNewton(picard=Newton())
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_an_equation_with_a_loop_is_not_written_out_in_front_of_the_loop(size):
+    """Each evaluation of a nonseparable Lagrangian has one: a second copy of the iteration would
+    double the code, and no trajectory of a batch would wait less."""
+
+    def count(F, solver):
+        x = jnp.ones(size)
+        search = jax.make_jaxpr(lambda x: find_root(lambda y: F(y) - x, x, x, solver)[0])(x)
+        return operation_count(search.jaxpr)
+
+    def plain(y):
+        return y + jnp.sin(y) / 2
+
+    def iterated(y):
+        return jax.lax.fori_loop(0, 3 + jnp.int32(y[0] > 0), lambda _, z: z - (plain(z) - y), y)
+
+    def in_branch(y):
+        return jax.lax.cond(y[0] > 0, iterated, plain, y)
+
+    assert count(plain, NestedNewton()) < 0.7 * count(plain, Newton())
+    for F in (iterated, in_branch, jax.jit(iterated)):
+        assert count(F, NestedNewton()) == count(F, Newton())
+
+
+def test_the_velocity_of_a_lagrangian_is_solved_for_in_one_loop():
+    def evaluation(solver):
+        H = dvi.legendre(lambda t, q, v, args: (1 + q @ q) * (v @ v) / 2 + (v @ v) ** 2, solver)
+        return jax.make_jaxpr(lambda p: jax.grad(H, 2)(0.0, ONE, p, None))(ONE).jaxpr
+
+    assert operation_count(evaluation(Newton())) == operation_count(evaluation(NestedNewton()))

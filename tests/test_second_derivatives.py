@@ -13,6 +13,7 @@ from dvi_jax.engine.in_pairs import in_pairs
 from dvi_jax.fit.optimise import _residual, _scalar_function
 from dvi_jax.fit.posterior import _finite_potential
 from dvi_jax.methods.step import to_grid
+from dvi_jax.systems import rings
 from dvi_jax.systems.boozer import _sums
 
 
@@ -83,6 +84,26 @@ def in_run(adjoint, arithmetic):
     return last
 
 
+def ring_run(x):
+    """x after two turns in a ring of a thin sextupole and a drift."""
+    ring = rings.Ring([rings.multipole("S", 0.0, (0.0, 0.0, 0.2)), rings.drift("D", 1.0)])
+    problem = rings.problem(ring)
+    sol = dvi.integrate(
+        problem.system, jnp.stack([x, 0 * x, 0 * x]), jnp.zeros(3), h=1.0, num_steps=2,
+        args=problem.args, method=rings.Turn(), save=dvi.Save(final=True),
+    )  # fmt: skip
+    return sol.q_final[0]
+
+
+def henon(x):
+    """The same as the map of Hénon."""
+    p = 0.0
+    for _ in range(2):
+        p = p - 0.2 * x * x
+        x = x + p
+    return x
+
+
 RULES = {
     "to_grid": (lambda x: to_grid(jnp.sin(x), 2.0**-40), jnp.sin),
     "in_pairs": (lambda x: in_pairs(jnp.sin, x).hi, jnp.sin),
@@ -96,6 +117,7 @@ RULES = {
     "potential": (potential, jnp.sin),
     "residuals": (residuals, lambda x: jnp.sin(x) - 2 * jnp.sin(0.7 * x)),
     "scaled loss": (scaled_loss, lambda x: jnp.sin(2 * x) / 2),
+    "ring": (ring_run, henon),
     "boozer": (
         lambda x: _sums.total(MODES, SHAPE, x, 0.3 * x, 0.7),
         lambda x: _sums.derivatives(MODES, SHAPE, x, 0.3 * x, 0.7, order=0)[0],

@@ -3,7 +3,7 @@
 import abc
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
 import lanewise
+from lanewise.jaxprs.extent import primitives_in
 
 from ..base.checks import positive, whole
 
@@ -97,10 +98,14 @@ class Newton(RootSolver):
     atol: float = eqx.field(static=True, default=0.0)
     max_steps: int = eqx.field(static=True, default=20)
 
+    is_nested: ClassVar[bool] = False
+
     def __check_init__(self):
         check_settings(self.rtol, self.atol, self.max_steps)
 
     def solve(self, F, x0, scales):
+        # In a loop in F trajectories of a batch wait for one another in any case.
+        waits = self.is_nested or "while" in primitives_in(jax.make_jaxpr(F)(x0).jaxpr)
         magnitude, eps = scales.size, float(jnp.finfo(x0.dtype).eps)
         tiny = float(jnp.finfo(x0.dtype).tiny)
 
@@ -121,7 +126,7 @@ class Newton(RootSolver):
             # third evaluation of F worth its time.
             is_large = shrinks & (worst * worst > eps / 16 * previous * _least_of(scale))
 
-            def third_correction():
+            def third():
                 nearer = jnp.where(is_large, x - second, x)
                 last = jnp.where(is_large, lanewise.solve(jacobian, F(nearer)), second)
                 return nearer, last, jnp.where(is_large, worst, previous)
@@ -129,9 +134,7 @@ class Newton(RootSolver):
             last = second
             if x0.size <= _THIRD_UP_TO:
                 is_needed = lanewise.on_any(is_large, rare=x0.size > _FIRST_APART)
-                x, last, previous = lax.cond(
-                    is_needed, third_correction, lambda: (x, second, previous)
-                )
+                x, last, previous = lax.cond(is_needed, third, lambda: (x, second, previous))
             worst = _largest_of(jnp.abs(last))
             # A last correction that is larger than the one before is round-off, or divergence.
             x = jnp.where(worst > previous, x, x - last)
@@ -164,7 +167,7 @@ class Newton(RootSolver):
         by_rate = self.rtol is None and self.atol == 0
         yes, nans = jnp.asarray(True), jnp.full((2,), jnp.nan, x0.dtype)
         start = _Iterate(x0, nans, yes, ~yes, jnp.asarray(0, jnp.int32))
-        if x0.size <= _FIRST_APART:
+        if x0.size <= _FIRST_APART and not waits:
             # Nearly all steps need one Jacobian: the first iteration is in front of the loop, where
             # no trajectory of a batch waits for another.
             x, second, scale, previous_first, worst = correct(x0)
@@ -175,8 +178,13 @@ class Newton(RootSolver):
         return RootInfo(end.x, end.iterations, end.error, end.converged & end.finite)
 
     def solve_tangent(self, linear, rhs):
-        _, matrix = value_and_jacobian(linear, jnp.zeros_like(rhs))
-        return lanewise.solve(matrix, rhs)
+        return lanewise.solve(value_and_jacobian(linear, jnp.zeros_like(rhs))[1], rhs)
+
+
+class NestedNewton(Newton):
+    """Newton's method in an equation of a step, which has a loop around it."""
+
+    is_nested: ClassVar[bool] = True
 
 
 _FIRST_APART = 4

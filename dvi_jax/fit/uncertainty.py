@@ -59,8 +59,8 @@ def conflict_of_priors(J: np.ndarray, priors: np.ndarray, basis: np.ndarray | No
     A, P = (x if basis is None else x @ basis for x in (J[:-n], J[-n:]))
     scale = inverse_or(np.linalg.norm(A, axis=0), 1.0)
     # At the minimum the derivatives of both sums are opposite.
-    root = np.linalg.qr(A * scale, mode="r").T
-    y = np.linalg.lstsq(root, scale * (P.T @ priors), _RANK)[0]
+    R = np.linalg.qr(A * scale, mode="r")
+    y = np.linalg.lstsq(np.transpose(R), scale * (P.T @ priors), _RANK)[0]
     return float(priors @ priors + y @ y)
 
 

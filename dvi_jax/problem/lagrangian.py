@@ -15,7 +15,7 @@ from lanewise.jaxprs.dependence import depends_on
 from ..base.checks import array
 from ..base.signature import accepts, check_takes, signature_of, takes_state, with_time
 from ..base.types import Args, ForceFn, HamiltonianFn, Scalar, State
-from ..engine.newton import Newton, Vector, find_root
+from ..engine.newton import NestedNewton, Newton, Vector, find_root
 
 _DEFECT = 1e-4
 """Fraction of the initial defect at which the damped search ends and Newton's method begins."""
@@ -147,8 +147,7 @@ def legendre(L: Callable[..., Any], root_finder: Newton = Newton()) -> Callable[
             f"L must be a function of (q, v), (t, q, v, args) or of (t0, t1, q0, v, args), got "
             f"{description}, which accepts {'both' if discrete else 'neither'}."
         )
-    kind = _DiscreteLegendreTransform if discrete else _LegendreTransform
-    return kind(L, root_finder)
+    return (_DiscreteLegendreTransform if discrete else _LegendreTransform)(L, root_finder)
 
 
 def from_lagrangian(L_d: Callable[..., Any], root_finder: Newton = Newton()) -> HamiltonianFn:
@@ -322,7 +321,7 @@ def _velocity(
 
 
 def _root(residual: Callable, guess: Vector, scale: Vector, root_finder: Newton) -> Vector:
-    x, info = find_root(residual, guess, scale, root_finder)
+    x, info = find_root(residual, guess, scale, NestedNewton(**vars(root_finder)))
     # An H_D has no status: NaN reports a failure, from which the step gets its status.
     return jnp.where(info.converged, x, jnp.nan)
 
@@ -353,8 +352,7 @@ def _start(slope: Callable[[Vector], Vector], p: Vector, zero: Vector) -> Vector
         part = jnp.where(gain, jnp.minimum(2 * part, 1), part / 2)
         return jnp.where(gain, trial, v), jnp.where(gain, new, left), part, trials + 1
 
-    start = (zero, size(zero), jnp.ones((), zero.dtype), 0)
-    return lax.while_loop(far, closer, start)[0]
+    return lax.while_loop(far, closer, (zero, size(zero), jnp.ones((), zero.dtype), 0))[0]
 
 
 def _scalar(value: Any, name: str) -> Scalar:

@@ -263,8 +263,8 @@ def from_surfaces(
 
     **Accuracy** The error is measured by leaving each surface out and predicting it from the
     others; at the ends it is scaled to the distance from s = 0 and s = 1. Between two surfaces it
-    is the change of the fit by leaving one surface out. The modes outside of `box` are not part of
-    it.
+    is the change of the fit by leaving one surface out: what is narrower than a gap, so that no
+    surface shows it, is not part of it, and neither are the modes outside of `box`.
     """
     s, values = _array("s", s, "surfaces"), _parts(B)
     periods, helicity = settings.get("periods", 1), settings.get("helicity", 0)
