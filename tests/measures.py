@@ -38,9 +38,9 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 15_165,
+    "lines of the core": 15_180,
     "lines of the questions": 22_040,
-    "lines of the leaves": 21_450,
+    "lines of the leaves": 21_470,
     "lines of lanewise": 12_670,
     "lines of the command line": 5_650,
     "raise statements": 661,

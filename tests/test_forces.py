@@ -222,11 +222,11 @@ def test_sums_factors_and_problems(state):
     )
     problem = systems.n_body(masses, q, p, G=0.9)
     step = 0.0, 0.1, q, p, problem.args
-    both = EVERY["harmonics"].on(problem).system.force(*step)
+    both = EVERY["harmonics"].add_to(problem).system.force(*step)
     wanted = problem.system.force(*step) + EVERY["harmonics"](*step)
     np.testing.assert_allclose(both, wanted, rtol=1e-14)
     with pytest.raises(TypeError, match="a problem of dvi_jax"):
-        EVERY["tides"].on(problem.system)
+        EVERY["tides"].add_to(problem.system)
     with pytest.raises(TypeError):
         EVERY["tides"] + 1.0
 
@@ -263,7 +263,7 @@ def test_only_some_bodies(state):
 def test_orders_and_gradients_with_wisdom_holman(state):
     """Forces of positions and of velocities in its kicks: order two, and the derivative by args."""
     three = EVERY["harmonics"] + EVERY["tides"] + EVERY["radiation"]
-    problem = ((lambda args: args["factor"]) * three).on(systems.n_body(MASSES, *state, G=0.9))
+    problem = ((lambda args: args["factor"]) * three).add_to(systems.n_body(MASSES, *state, G=0.9))
 
     def end(h, factor=1.0, method=dvi.WisdomHolman()):
         args = problem.args | {"factor": factor}

@@ -1,7 +1,7 @@
 r"""Perturbing forces on N bodies and satellites.
 
     force = dvi.forces.Relativity(c) + dvi.forces.Harmonics(radius, {2: J2})
-    problem = force.on(systems.n_body(masses, q0, p0))
+    problem = force.add_to(systems.n_body(masses, q0, p0))
 
 Each force is a function W(t0, t1, q0, p1, args) for a `System`; `Force` explains the states that it
 takes, sums and factors. A parameter is a number or a function of args, so that fits and sweeps can

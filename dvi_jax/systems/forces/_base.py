@@ -55,7 +55,7 @@ class Force(eqx.Module):
       origin, and ``args["mu"]`` is G times its mass.
 
     ``f + g`` is the sum of two forces and ``a * f`` a force with a strength a, a number or a
-    function of args. `on` adds a force to a problem.
+    function of args. `add_to` adds a force to a problem.
     """
 
     @abc.abstractmethod
@@ -63,8 +63,8 @@ class Force(eqx.Module):
         """The accelerations of all bodies, shape (bodies, dim)."""
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> State:
-        at = bodies_of(q0, p1, args)
-        force = at.scale[:, None] * self.accelerations(t0, at, args)
+        state = bodies_of(q0, p1, args)
+        force = state.scale[:, None] * self.accelerations(t0, state, args)
         return force[1] if q0.ndim == 1 else force
 
     def __add__(self, other: Any) -> "Force":
@@ -73,7 +73,7 @@ class Force(eqx.Module):
     def __rmul__(self, strength: Any) -> "Force":
         return Multiple(strength, self)
 
-    def on(self, problem: Problem, epsilon: float = 1.0) -> Problem:
+    def add_to(self, problem: Problem, epsilon: float = 1.0) -> Problem:
         """The problem with this force, next to the forces that it has; ε of its runs is `epsilon`.
 
         Its known invariants and symmetries are those without this force.
@@ -82,10 +82,10 @@ class Force(eqx.Module):
         """
         instance("problem", problem, Problem, "a problem of dvi_jax.systems")
         system = problem.system
-        force = self if system.force is None else _Both(system.force, system.epsilon, self)
+        force = self if system.force is None else _Pair(system.force, system.epsilon, self)
         fields = {"perturbation": system.perturbation, "slow_time": system.slow_time}
-        disturbed = System(system.H_D, force=force, epsilon=epsilon, **fields)
-        return dataclasses.replace(problem, system=disturbed)
+        new_system = System(system.H_D, force=force, epsilon=epsilon, **fields)
+        return dataclasses.replace(problem, system=new_system)
 
 
 class Sum(Force):
@@ -109,7 +109,7 @@ class Multiple(Force):
         return factor * self.force.accelerations(t, bodies, args)
 
 
-class _Both(eqx.Module):
+class _Pair(eqx.Module):
     first: Any
     epsilon: Any
     second: Force
@@ -142,8 +142,8 @@ class Central(Force):
     def accelerations(self, t, bodies, args):
         count, c = len(bodies.x), whole("centre", self.centre, 0, len(bodies.x) - 1)
         all_others = [i for i in range(count) if i != c]
-        chosen = all_others if self.on_bodies is None else self.on_bodies
-        others = np.array([one_of("each of on_bodies", i, all_others) for i in chosen])
+        indices = all_others if self.on_bodies is None else self.on_bodies
+        others = np.array([one_of("each of on_bodies", i, all_others) for i in indices])
         r, v = (x[others] - x[c][None] for x in (bodies.x, bodies.v))
         masses = bodies.masses[others]
         a = self.relative(t, r, v, bodies.masses[c], masses, args)

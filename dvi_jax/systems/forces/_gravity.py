@@ -53,11 +53,11 @@ class Harmonics(Central):
 
     def energy(self, t0, t1, q0, p1, args):
         """Σ m_i Φ(x_i − x_0) [mass length²/time²]."""
-        at = bodies_of(q0, p1, args)
-        r = jnp.delete(at.x, self.centre, axis=0) - at.x[self.centre][None]
-        axes, mu = self._axes(t0, r, args), at.masses[self.centre]
+        state = bodies_of(q0, p1, args)
+        r = jnp.delete(state.x, self.centre, axis=0) - state.x[self.centre][None]
+        axes, mu = self._axes(t0, r, args), state.masses[self.centre]
         potentials = jax.vmap(lambda r: self._potential(r, axes, mu, args))(r)
-        return jnp.sum(jnp.delete(at.scale, self.centre) * potentials)
+        return jnp.sum(jnp.delete(state.scale, self.centre) * potentials)
 
     def _axes(self, t: Any, r: Array, args: Any) -> Array:
         """The axes of the body, as rows."""
@@ -65,8 +65,10 @@ class Harmonics(Central):
         z = pole / jnp.sqrt(jnp.sum(pole * pole))
         level = jnp.sqrt(z[0] * z[0] + z[1] * z[1])
         is_up = level == 0
-        over = 1 / jnp.where(is_up, 1.0, level)
-        node = jnp.stack([jnp.where(is_up, 1.0, -z[1] * over), z[0] * over, jnp.zeros_like(over)])
+        inverse = 1 / jnp.where(is_up, 1.0, level)
+        node = jnp.stack(
+            [jnp.where(is_up, 1.0, -z[1] * inverse), z[0] * inverse, jnp.zeros_like(inverse)]
+        )
         angle = value_of(self.angle, args, r) + value_of(self.rate, args, r) * t
         cosine, sine, other = jnp.cos(angle), jnp.sin(angle), jnp.cross(z, node)
         return jnp.stack([cosine * node + sine * other, cosine * other - sine * node, z])
@@ -80,8 +82,8 @@ class Harmonics(Central):
             terms[n, 0] = (-value_of(J, args, r), 0.0)
         for (n, m), pair in self.tesseral.items():
             C, S = value_of(pair, args, r)
-            before = terms.get((n, m), (0.0, 0.0))
-            terms[n, m] = (before[0] + C, before[1] + S)
+            of_zonal, _ = terms.get((n, m), (0.0, 0.0))
+            terms[n, m] = (of_zonal + C, S)
         total = jnp.zeros_like(distance)
         for m in sorted({m for _, m in terms}):
             # cos^m φ (cos mλ, sin mλ) = (x + iy)^m/r^m, without the angle λ
@@ -97,10 +99,10 @@ class Harmonics(Central):
         return -mu / distance * total
 
 
-def _legendre(s: Array, m: int, most: int) -> dict[int, Array]:
-    """P_nm(s)/cosᵐ φ for n up to `most`."""
+def _legendre(s: Array, m: int, degree: int) -> dict[int, Array]:
+    """P_nm(s)/cosᵐ φ for n up to `degree`."""
     P = {m - 1: jnp.zeros_like(s), m: jnp.full_like(s, math.prod(range(1, 2 * m, 2)))}
-    for n in range(m + 1, most + 1):
+    for n in range(m + 1, degree + 1):
         P[n] = ((2 * n - 1) * s * P[n - 1] - (n + m - 1) * P[n - 2]) / (n - m)
     return P
 
@@ -218,5 +220,5 @@ class LenseThirring(Central):
     def relative(self, t, r, v, mu, masses, args):
         J = vector("momentum of LenseThirring", self.momentum, args, r)
         r2 = jnp.sum(r * r, -1, keepdims=True)
-        along = 3 * jnp.sum(J * r, -1, keepdims=True) / r2 * r
-        return 2 / (value_of(self.c, args, r) ** 2 * r2**1.5) * jnp.cross(along - J, v)
+        radial = 3 * jnp.sum(J * r, -1, keepdims=True) / r2 * r
+        return 2 / (value_of(self.c, args, r) ** 2 * r2**1.5) * jnp.cross(radial - J, v)
