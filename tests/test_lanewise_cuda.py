@@ -5,17 +5,20 @@ import functools
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import ptx_on_cpu
 import pytest
-from test_lanewise_threads import assert_same_bits, by_numbers
+from test_lanewise_threads import assert_same_bits, by_numbers, lowered, on_gpus as on_gpus
 
+import lanewise
 from lanewise.llvm.ir import NotCompilable
 from lanewise.native import cuda, handler
 from lanewise.native.structures import STRUCTURES, offset, size
+from lanewise.targets import threads
 from lanewise.targets.threads import ptx_of
 
 STREAM, KERNEL, CONTEXT, ERROR = 0x51, 0xCE, 0xC0, 0xBAD
@@ -166,10 +169,18 @@ LANES = 150  # no multiple of the threads of a block
 
 @pytest.fixture
 def installed(monkeypatch):
-    """Replaces the driver."""
+    """Replaces the driver; None: there is none."""
+    real = ctypes.CDLL
 
     def install(library):
-        monkeypatch.setattr(cuda.ctypes, "CDLL", lambda name: library)
+        def load(name, *args, **options):
+            if name != "libcuda.so.1":
+                return real(name, *args, **options)  # LLVM, if it is not started yet
+            if library is None:
+                raise OSError(f"{name}: cannot open shared object file")
+            return library
+
+        monkeypatch.setattr(cuda.ctypes, "CDLL", load)
         monkeypatch.setattr(cuda, "driver", functools.cache(cuda.driver.__wrapped__))
         monkeypatch.setattr(cuda, "_names", set())
         return library
@@ -288,17 +299,13 @@ def test_a_kernel_that_cannot_run_is_left_to_xla(installed, settings, reason):
     assert not library.retained
 
 
-def test_without_a_driver_or_with_an_old_one_there_is_a_reason(installed, monkeypatch):
+def test_without_a_driver_or_with_an_old_one_there_is_a_reason(installed):
     library = installed(Library())
     del library.cuLibraryLoadData
     with pytest.raises(NotCompilable, match="no function cuLibraryLoadData: it is too old"):
         cuda.register(ptx_of(FUNCTION, FLAGS, 90), [0])
 
-    def missing(name):
-        raise OSError(f"{name}: cannot open shared object file")
-
-    monkeypatch.setattr(cuda.ctypes, "CDLL", missing)
-    cuda.driver.cache_clear()
+    installed(None)
     with pytest.raises(NotCompilable, match=r"there is no CUDA driver: libcuda.so.1: cannot open"):
         cuda.register(ptx_of(FUNCTION, FLAGS, 90), [0])
 
@@ -332,6 +339,35 @@ def test_a_grid_that_is_too_large_is_refused():
     assert run(frame.address) == ERROR
     assert library.launches[0][1] == 2**32 - 1
     assert "CUDA_ERROR_INVALID_VALUE" in frame.errors[0][0]
+
+
+REFUSALS = {
+    "no driver": None, "an old driver": {"version": 11_080},
+    "no device": {"fails": {"cuInit": 100}},
+    "PTX is refused": {"fails": {"cuLibraryLoadData": 218}},
+    "no memory": {"fails": {"cuKernelGetFunction": 2}},
+    "too much local memory": {"local": 2**20},
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("on_gpus")
+@pytest.mark.parametrize("name", REFUSALS)
+def test_a_program_that_the_driver_refuses_is_compiled_by_xla(installed, monkeypatch, name):
+    """Also one of several pieces; the CPU's code is unaffected."""
+    settings = REFUSALS[name]
+    installed(None if settings is None else Library(**settings))
+    gpu = SimpleNamespace(compute_capability="9.0", process_index=0, local_hardware_id=0)
+    monkeypatch.setattr(threads, "gpus", lambda: [gpu])
+
+    def of_pieces(x, v):
+        return lanewise.call(lambda x, v: function_of_one(x, jnp.fft.fft(v).real, x), x, v)
+
+    x, v = np.ones(LANES), np.ones((LANES, 3))
+    for function in (of_pieces, lambda x, v: lanewise.call(function_of_one, x, v, x)):
+        text = lowered(function, x, v)
+        assert "custom_call @lanewise" not in text
+        assert "stablehlo.while" in text
+        assert np.isfinite(jax.jit(jax.vmap(function))(x, v)[0]).all()
 
 
 IMPORT = """
