@@ -404,6 +404,9 @@ CASES = {
     "no step": (lambda x: lax.scan(lambda c, _: (c + 1, c), x, None, length=0), VALUES),
     "empty": (lambda x: (x[None][:0], jnp.zeros((3, 0)), x), VALUES),
     "an empty operand": (lambda x: (x * 2, 1.0), np.zeros((9, 0))),
+    "nothing to sort": (
+        lambda x: (jnp.sort(x), jnp.argsort(x[None], axis=1), jnp.cumsum(x)), np.zeros((9, 0))
+    ),
     "unsigned, inverted": (lambda n: ~n, np.arange(9, dtype="uint32")),
     "constants only": (lambda x: (1.0, jnp.arange(3), True), VALUES),
     "a call in a call": (

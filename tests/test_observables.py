@@ -153,6 +153,31 @@ def test_integers_and_booleans_stay_what_they_are(adjoint):
     assert int(run(num_steps=3, observe=as_real).observed) != LARGE + 7
 
 
+EMPTY = {
+    "last": dvi.Last(lambda q, p: q[:0]),
+    "mean": dvi.Mean(lambda q, p: jnp.zeros((3, 0))),
+    "each": lambda q, p: jnp.sort(jnp.zeros((0, 3), jnp.int32), axis=0),
+    "running": dvi.Running(dvi.Range(lambda q, p: p[:0])),
+}
+
+
+@pytest.mark.parametrize(
+    "adjoint",
+    [dvi.Checkpointed(), dvi.Direct(), pytest.param(dvi.Reversible(), marks=pytest.mark.slow)],
+)
+def test_observables_without_entries(adjoint):
+    """A run in segments divided by their number of entries."""
+
+    def final(mu):
+        found = run(mu=mu, observe=EMPTY, adjoint=adjoint, num_steps=9, save=dvi.Save(every=1))
+        shapes = {name: x.shape for name, x in found.observed.items()}
+        assert shapes == {"last": (0,), "mean": (3, 0), "each": (10, 0, 3), "running": (9, 0)}
+        return found.qs[-1].sum() + found.observed["last"].sum()
+
+    slope = (final(1.1 + 1e-6) - final(1.1 - 1e-6)) / 2e-6
+    assert jax.grad(final)(1.1) == pytest.approx(float(slope), rel=1e-6)
+
+
 def test_integers_next_to_a_gradient_and_after_a_failure():
     observe = {"n": dvi.Last(count), "E": dvi.Last(energy), "r": dvi.Range(count)}
 

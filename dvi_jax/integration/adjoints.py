@@ -87,7 +87,7 @@ class Checkpointed(AbstractAdjoint):
             return jax.checkpoint(lambda carry, _: lax.scan(body, carry, None, length))
 
         carry, ys = lax.scan(segment(size), carry, None, segments)
-        ys = jax.tree.map(lambda y: y.reshape(-1, *y.shape[2:]), ys)
+        ys = jax.tree.map(lambda y: lax.collapse(y, 0, 2), ys)
         # A shorter last segment, without padding: a step beyond the end could fail.
         left = count - size * segments
         if left:

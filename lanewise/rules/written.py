@@ -119,6 +119,8 @@ def cholesky(a: Array, **_) -> Array:
 def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
     """Arrays in the order of the first `num_keys` of them, by exchanges of neighbours."""
     n = arrays[0].shape[dimension]
+    if n == 0:
+        return list(arrays)
     check_size(n, MOST_SORTED, "numbers to sort")
     items = [[lax.index_in_dim(x, i, dimension, False) for x in arrays] for i in range(n)]
     # Exchanges at fixed places, whatever the numbers are: odd and even neighbours in turn.
