@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 import types
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -179,6 +180,19 @@ def test_the_mode_and_its_covariance():
     student_t = dvi.Posterior(LINE, data, PAIR, loss=dvi.Likelihood(student))
     mode, root = student_t.laplace()
     assert np.abs(jax.grad(student_t.potential)(jnp.asarray(mode)) @ root).max() < 1e-2
+
+
+@pytest.mark.slow
+def test_samples_say_that_a_prior_contradicts_the_data():
+    """The speed of the data is 0.9, and residuals hardly show the difference."""
+    options = {"num_samples": 20, "num_warmup": 20, "chains": 2, "explore": 0}
+    for speed, is_wrong in ((2.5, True), (1.0, False)):
+        priors = {"p0": dvi.Prior(speed, 0.2)}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # so few draws hardly agree
+            found = dvi.sample(LINE, on_a_line(), PAIR, priors=priors, **options)
+        text = "\n".join(found.warnings)
+        assert ("priors contradict the data" in text) == is_wrong
 
 
 @pytest.mark.slow

@@ -347,6 +347,19 @@ def test_an_identification_says_that_residuals_contradict_sigma():
     assert "the residuals contradict sigma: reduced chi² must be 1 ± 0.1 and is" in str(it)
 
 
+@pytest.mark.slow
+def test_an_identification_says_that_a_prior_contradicts_the_data():
+    data = observed(
+        dvi.System(H_D, force=SMALL.with_coefficients({"cubic": 0.3})), [1.2], [0.0], 100, 0
+    )
+    for start, is_wrong in ((1.5, True), (1.2, False)):
+        it = dvi.identify(
+            dvi.Model(FREE, h=H, p0=[0.0]), data, SMALL, {"q0": np.array([1.2])},
+            priors={"q0": dvi.Prior(start, 0.03)},
+        )  # fmt: skip
+        assert ("priors contradict the data" in str(it)) == is_wrong
+
+
 INVALID_LIBRARIES = [
     (lambda: dvi.ForceLibrary([Q]), TypeError, "must be a dict"),
     (lambda: dvi.ForceLibrary({}), ValueError, "at least one"),
