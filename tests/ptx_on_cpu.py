@@ -337,6 +337,17 @@ class Function:
         name = {"l": "fshl", "r": "fshr"}[parts[0]]
         self.write(x[0], self.call(name, "i32", [high, low, by], "i32"), "i32")
 
+    def do_prmt(self, parts: list[str], x: list[str]) -> None:
+        """Four bytes, each the one of eight that a digit of the last operand selects."""
+        assert parts == ["b32"], parts
+        low, high = (self.resized(self.read(y, "i32"), "i32", "i64") for y in x[1:3])
+        both, total = self.new(f"or i64 {low}, {self.new(f'shl i64 {high}, 32')}"), "0"
+        for i, digit in enumerate(reversed(f"{int(x[3].rstrip('U'), 0):04x}")):
+            assert digit in "01234567", x  # others repeat a sign
+            byte = self.new(f"and i64 {self.new(f'lshr i64 {both}, {8 * int(digit)}')}, 255")
+            total = self.new(f"or i64 {total}, {self.new(f'shl i64 {byte}, {8 * i}')}")
+        self.write(x[0], total, "i64")
+
     def do_bfe(self, parts: list[str], x: list[str]) -> None:
         kind, is_signed = integer_type(parts[-1]), parts[-1][0] == "s"
         size, start, count = bits_of(kind), int(x[2]), int(x[3])

@@ -239,6 +239,9 @@ OTHERS = {
         "f", lambda x: lanewise.with_derivative(lambda x: [x * x], lambda x, dx: [dx[0]], [x])
     ),
     "custom": ("f", jax.nn.silu),
+    "long truth": ("f", lambda x: lax.scan(lambda c, z: (c ^ z, c), x > 0, np.arange(150) % 3 > 0)),
+    "bytes": ("f", lambda x: [jnp.asarray(np.resize(v, 150)) for v in (np.int8([-128, 127]),
+                                                                       np.array([True, False]))]),
 }  # fmt: skip
 
 
