@@ -336,7 +336,7 @@ RINGS_IN_6D = {"phase of π": {"phase": np.pi}, "lag": {"lag": 1.0}}
 def test_the_rounding_of_many_turns_has_no_sign(name):
     """The actions of small amplitudes are constant. A rotation whose c² + s² is not 1 changes all
     of them by 3 to 10 units of round-off in a turn, and 1 + hx − pz in a bend by far more. Sines
-    and momenta of order 1 in a pole face or a cavity would change them by 1e-5 to 1e-3."""
+    and momenta of order 1 in a pole face or a cavity would change them by 1e-7 to 1e-3."""
     ring, turns = long_cell(name), 20_000
     planes = 3 if name in RINGS_IN_6D else 2
     modes = np.asarray(rings.optics(ring, chromatic=False).modes[0, :planes])
