@@ -169,7 +169,7 @@ LANES = 150  # no multiple of the threads of a block
 
 @pytest.fixture
 def installed(monkeypatch):
-    """Replaces the driver; None: there is none."""
+    """Replaces the driver; None: it does not exist."""
     real = ctypes.CDLL
 
     def install(library):

@@ -112,7 +112,7 @@ def derivatives(c: Coefficients, shape: Shape, x: Any, y: Any, zeta: Any, order:
     def add(carry, row):
         (sums, w0, w1, w2, turn), (c_m, m) = carry, row  # w^m, w^{m−1}, w^{m−2}
         A, *tail = _over_k(c_m, s, lowest, factor, lambda k: N * (k + h * m), order)
-        following = _times(w0, w), w0, w1, turn and _times(turn, helix)
+        following = _times(w0, w), w0, w1, _times(turn, helix) if helix else None
         if h:
             A, *tail = (_times(turn, a) for a in (A, *tail))
         terms = [_times(w0, A)[0]]
