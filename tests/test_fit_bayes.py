@@ -419,6 +419,19 @@ def test_more_maxima_than_chains_are_not_mixed():
     assert dataclasses.replace(good, maxima=np.zeros((2, 1))).status == "not_mixed"
 
 
+def test_the_warning_of_several_maxima_names_the_parameters_that_differ():
+    """Five parameters, of which the text has room for three; the last one differs."""
+    posterior = Bumps(np.zeros(5), either_sign)
+    points = np.array([[1e-6, 40.0, 3.0, 2.0, x] for x in (-1.0, 1.0)])
+    found = [maxima.Maximum(x, np.eye(5), 0.0, 0.5) for x in points]
+    x = np.random.default_rng(0).normal(size=(1, 40, 5))
+    about = {"potential_energy": x[..., 0], "diverging": x[..., 0] > 9, "num_steps": x[..., 0]}
+    samples = bayes.collect(posterior, x, about | {"mean_accept_prob": x[..., 0]}, [], 99, found)
+    (text,) = [note for note in samples.warnings if "2 maxima" in note]
+    assert "params[4] = -1, " in text
+    assert "params[4] = 1, " in text
+
+
 def fake(x, diverging=0, steps=3):
     """`Samples` of draws x (chains, draws) of one parameter, as `sample` collects them."""
     posterior = dvi.Posterior(NEAR_0, truncated()[0], {"q0": 0.1 * np.ones(1)})

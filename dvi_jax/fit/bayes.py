@@ -327,8 +327,12 @@ def _doubts(samples: Samples, longest: int) -> list[str]:
             "if R̂ stays large, give priors: the density has several maxima or is not determined."
         )
     if len(samples.maxima) > 1 and samples.status == "not_mixed":
-        pairs = zip(samples.maxima, samples.shares, strict=True)
-        listing = [f"{_in_words(samples.names, x)} ({100 * s:.2g} %)" for x, s in pairs]
+        # The parameters that differ most, in parts of themselves, come first.
+        size = np.abs(samples.maxima).max(axis=0) + np.finfo(float).tiny
+        order = np.argsort(-np.ptp(samples.maxima, axis=0) / size, stable=True)
+        names = [samples.names[i] for i in order]
+        pairs = zip(samples.maxima[:, order], samples.shares, strict=True)
+        listing = [f"{_in_words(names, x)} ({100 * s:.2g} %)" for x, s in pairs]
         notes.append(
             f"the density has {len(listing)} maxima, with parts of the probability by normal "
             f"approximations: {'; '.join(listing[:8])}. The draws have one part for each chain. "
