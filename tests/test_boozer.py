@@ -485,6 +485,27 @@ def test_wide_gaps_between_surfaces_are_refused(given, centre, message):
         boozer.from_surfaces(given, [0], [0], modes[:, None], **profiles)
 
 
+@pytest.mark.parametrize(
+    ("gap", "width", "size"),
+    [((0.14, 0.34), 0.11, 0.039), ((0.578, 0.778), 0.128, 0.029), ((0.107, 0.307), 0.112, 0.041),
+     ((0.155, 0.355), 0.132, 0.035)],
+)  # fmt: skip
+def test_degrees_that_differ_in_a_gap_are_an_error(gap, width, size):
+    """A bump in a gap: two degrees that predict the surfaces nearly as well differ there."""
+    even = np.linspace(0.03, 1.0, 13)
+    given = np.array([*even[even < gap[0] - 0.02], *gap, *even[even > gap[1] + 0.02]])
+    profiles = {"iota": 0.4 + 0.1 * given, "G": 5 + 0 * given, "psi_edge": 1.0}
+
+    def field(size):
+        bump = 5 * size * np.exp(-(((given - np.mean(gap)) / width) ** 2))
+        modes = np.stack([5 + 0 * given, -0.3 * np.sqrt(given) * (1 + 0.2 * given), bump], -1)
+        return boozer.from_surfaces(given, [0, 1, 0], [0, 0, 1], modes, **profiles)
+
+    with pytest.raises(ValueError, match=r"with 1[12] surfaces"):
+        field(size)
+    field(size / 10)
+
+
 NEAR_AXIS = ["precise QA", *(pytest.param(x, marks=slow) for x in ("precise QH", "r2 section 5.5"))]
 
 

@@ -263,8 +263,9 @@ def from_surfaces(
 
     **Accuracy** The error is measured by leaving each surface out and predicting it from the
     others; at the ends it is scaled to the distance from s = 0 and s = 1. Between two surfaces it
-    is the change of the fit by leaving one surface out: what is narrower than a gap, so that no
-    surface shows it, is not part of it, and neither are the modes outside of `box`.
+    is the change of the fit by leaving one surface out, or by another degree that predicts nearly
+    as well. What is narrower than a gap, so that no surface shows it, is not part of it, and
+    neither are the modes outside of `box`.
     """
     s, values = _array("s", s, "surfaces"), _parts(B)
     periods, helicity = settings.get("periods", 1), settings.get("helicity", 0)
@@ -356,7 +357,8 @@ def _fit(
     residual/(1 − H_ii) with the projection H of the fit, and the degree is the one, up to `degree`,
     for which it is smallest. The errors at both ends, where this is an extrapolation, are scaled
     to the distance from s = 0 and s = 1. That in a gap, which may be wide, is the largest change of
-    the fit there if one surface is left out.
+    the fit there if one surface is left out, or if the degree is another one of nearly the same
+    error.
     """
     columns = values.reshape(len(s), -1)
     c, middles = np.zeros((columns.shape[1], degree + 1)), (s[1:] + s[:-1]) / 2
@@ -368,6 +370,7 @@ def _fit(
     def basis_at(x, d):
         return np.polynomial.chebyshev.chebvander(2 * x - 1, d) * (x**power)[:, None]
 
+    scores, predictions = [np.sum(errors[: len(s)] ** 2, axis=0)], [np.zeros_like(errors[len(s) :])]
     for d in range(min(degree, len(s) - 2) + 1):
         left, sizes, right = np.linalg.svd(basis_at(s, d), full_matrices=False)
         rank = int(np.sum(sizes > 1e-10 * sizes[0]))
@@ -379,10 +382,22 @@ def _fit(
         estimates = np.maximum(residuals, weights * left_out)
         changes = np.abs(basis_at(middles, d) @ inverse @ left.T)
         gap_errors = np.max([np.outer(changes[:, i], left_out[i]) for i in range(len(s))], axis=0)
-        better = np.sum(estimates**2, axis=0) < np.sum(errors[: len(s)] ** 2, axis=0)
+        scores.append(np.sum(estimates**2, axis=0))
+        predictions.append(basis_at(middles, d) @ inverse @ (left.T @ columns))
+        better = scores[-1] < np.sum(errors[: len(s)] ** 2, axis=0)
         errors[:, better], c[better] = np.vstack([estimates, gap_errors])[:, better], 0.0
         c[better, : d + 1] = (inverse @ (left.T @ columns[:, better])).T @ _monomials(d)
+    # Degrees that predict nearly as well may differ in a gap more than any of them shows there.
+    best, predicted = np.argmin(scores, axis=0), np.array(predictions)
+    is_close = np.array(scores) < _NEARLY**2 * np.min(scores, axis=0)
+    apart = np.abs(predicted - np.take_along_axis(predicted, best[None, None], axis=0))
+    apart = np.max(np.where(is_close[:, None], apart, 0.0), axis=0)
+    errors[len(s) :] = np.maximum(errors[len(s) :], apart)
     return c.reshape(*values.shape[1:], degree + 1), errors.reshape(-1, *values.shape[1:])
+
+
+_NEARLY = 2.0
+"""Ratio of the errors of two degrees up to which both count."""
 
 
 def _monomials(degree: int) -> np.ndarray:
