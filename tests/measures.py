@@ -40,7 +40,7 @@ LONGEST_FILE, MOST_PARAMETERS = 450, 9
 LIMITS: dict[str, float] = {
     "lines of the core": 15_180,
     "lines of the questions": 22_040,
-    "lines of the leaves": 21_470,
+    "lines of the leaves": 21_480,
     "lines of lanewise": 12_700,
     "lines of the command line": 5_650,
     "raise statements": 661,
