@@ -301,7 +301,9 @@ def test_elements_of_a_solution_of_bodies():
 
 
 @pytest.mark.parametrize("method", [
-    dvi.WisdomHolman(), dvi.WisdomHolman(corrector=5), dvi.WisdomHolman("democratic"),
+    pytest.param(dvi.WisdomHolman(), marks=pytest.mark.slow),
+    pytest.param(dvi.WisdomHolman(corrector=5), marks=pytest.mark.slow),
+    dvi.WisdomHolman("democratic"),
 ])  # fmt: skip
 def test_test_particles_in_wisdom_holman(method):
     """The massive bodies move as without them, and they as in another method, with its order."""

@@ -428,7 +428,9 @@ def test_results_of_a_gpu_are_copied_while_it_computes(monkeypatch):
 
     def compute(program, task, device):
         used.append(device)
-        at_once[devices.index(device)].wait()
+        # The first two tasks of a device; it may have an odd number of them in all.
+        if used.count(device) <= 2:
+            at_once[devices.index(device)].wait()
         return run(program, task, jax.devices()[0])
 
     monkeypatch.setattr(workers, "compute", compute)
@@ -438,6 +440,7 @@ def test_results_of_a_gpu_are_copied_while_it_computes(monkeypatch):
     program.devices = devices
     results = []
     for tasks_of_a_gpu, is_broken in ((2, False), (1, True)):
+        used.clear()
         monkeypatch.setattr(workers, "_PER_GPU", tasks_of_a_gpu)
         at_once = [threading.Barrier(2, timeout=0.5 if is_broken else 60) for _ in devices]
         sink = stores.MemorySink(program.plan, arrays)
