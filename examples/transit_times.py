@@ -120,6 +120,8 @@ def starting(times):
 
 
 def main(quick, directory):
+    if directory:  # before minutes of work
+        Path(directory).mkdir(parents=True, exist_ok=True)
     times = simulated(np.random.default_rng(1))
     data, priors = observations(times), {"ecos": dvi.Prior(0.0, 0.05), "esin": dvi.Prior(0.0, 0.05)}
     bounds = {"mass": dvi.Bounds(0.0, 1e-3)}
