@@ -344,7 +344,7 @@ def test_bad_input():
     for wrong, text in [
         (lambda: of_bodies(q, p, MASSES, frame="solar"), "frame must be one of 'jacobi'"),
         (lambda: of_bodies(q, p, MASSES, kind="Kepler"), "kind must be one of 'Keplerian'"),
-        (lambda: of_bodies(q, p, np.ones(5)), "test particles must be"),
+        (lambda: of_bodies(q, p, np.ones(5)), "number of masses must be"),
         (lambda: of_bodies(q, p[:2], MASSES), "p must be"),
         (lambda: Keplerian.from_state(q[0, :1], p[0, :1], 1.0), "last axis of q"),
         (lambda: planets(0).state(1.0, dim=4), "dim must be one of 2, 3"),

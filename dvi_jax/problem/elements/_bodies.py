@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ...base.checks import array, instance, one_of
+from ...base.checks import array, instance, one_of, whole
 from ...base.types import Args, Scalar, State
 from ..flows import value_of
 from ..frames import Barycentric, Heliocentric, Jacobi
@@ -141,6 +141,5 @@ def _masses(masses: Any, bodies: int) -> tuple[Array, Array]:
     masses = jnp.asarray(masses, jnp.result_type(float))
     array("masses", masses, ("bodies",))
     # The momentum of a test particle would be 0 and determine no velocity.
-    tests = bodies - len(masses)
-    one_of("the number of test particles", tests, range(bodies))
+    tests = bodies - whole("the number of masses", len(masses), 1, bodies)
     return jnp.pad(masses, (0, tests)), jnp.pad(masses, (0, tests), constant_values=1.0)
