@@ -100,11 +100,11 @@ def _implicit(kernel: str, H_D, n: int, half_width: float, method=None) -> Workl
     return Workload(kernel, system, n, 0.02, 0.0, 0.0, spread, method=method)
 
 
-def _mirror() -> Workload:
+def _mirror(kernel: str, method=None) -> Workload:
     """The magnetic mirror with W = −q0; the kernel solves the linear equation for p1 directly."""
     problem = systems.magnetic_mirror()
     return Workload(
-        "mirror",
+        kernel,
         dvi.System(charged_particle, force=linear_force),
         3,
         problem.h,
@@ -113,6 +113,7 @@ def _mirror() -> Workload:
         (0.1, 0.1),
         is_explicit=True,
         args=problem.args,
+        method=method,
     )
 
 
@@ -137,7 +138,8 @@ WORKLOADS = {
     "pendulum_gauss": _implicit("pendulum_gauss", pendulum, 2, 0.5, dvi.GaussLegendre(2)),
     "pendulum_yoshida": _implicit("pendulum_yoshida", pendulum, 2, 0.5, dvi.Yoshida(4)),
     "pendulum_kahan_li": _implicit("", pendulum, 2, 0.5, dvi.KahanLi(8)),
-    "mirror": _mirror(),
+    "mirror": _mirror("mirror"),
+    "boris": _mirror("boris", dvi.Boris()),
     "chain2": _implicit("chain2", chain, 2, 0.5),
     "chain4": _implicit("chain4", chain, 4, 0.5),
     "chain10": _implicit("chain10_tridiagonal", chain, 10, 0.3),

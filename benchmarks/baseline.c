@@ -15,6 +15,7 @@ for the Hamiltonians
     web           the same with B over all pairs: a full Jacobian
     mirror        a charged particle between magnetic mirrors, |p - A|^2/2 with the vector
                   potential A = (1 + (z/LENGTH)^2)/2 (-y, x, 0); (13) is linear in p1
+    boris         the same particle by the method of Boris, in q and v = p - A
 
 and, for the pendulum, two methods of order 4: `pendulum_gauss` is Gauss-Legendre collocation with
 two stages, `pendulum_yoshida` composes three Strang steps, each of the map and its adjoint.
@@ -668,6 +669,39 @@ INLINE void NAME(mirror_step)(REAL *q, REAL *p, double h, double kick)
     q[2] += h * p[2];
 }
 
+/* v = p - A(q), or p = v + A(q) with the other sign. */
+INLINE void NAME(boris_change)(const REAL *q, REAL *p, double sign)
+{
+    REAL z = q[2] * (1.0 / LENGTH), g = sign * (0.5 + 0.5 * z * z);
+    p[0] -= g * q[1];
+    p[1] += g * q[0];
+}
+
+INLINE void NAME(boris_drift)(REAL *q, const REAL *v, double h)
+{
+    UNROLL for (int i = 0; i < 3; i++)
+        q[i] += h * v[i];
+}
+
+/* Half a kick, the rotation by the vector t = h B/2 of Cayley's form, half a kick. */
+INLINE void NAME(boris_step)(REAL *q, REAL *v, double h, double kick)
+{
+    REAL z = q[2] * (0.5 * h / (LENGTH * LENGTH)), half = z * q[2] + 0.5 * h;
+    REAL t[3] = {-z * q[0], -z * q[1], half}, u[3], w[3];
+    UNROLL for (int i = 0; i < 3; i++)
+        u[i] = v[i] - 0.5 * kick * q[i];
+    w[0] = u[0] + u[1] * t[2] - u[2] * t[1];
+    w[1] = u[1] + u[2] * t[0] - u[0] * t[2];
+    w[2] = u[2] + u[0] * t[1] - u[1] * t[0];
+    REAL scale = 2.0 / (1.0 + t[0] * t[0] + t[1] * t[1] + t[2] * t[2]);
+    UNROLL for (int i = 0; i < 3; i++)
+        t[i] *= scale;
+    v[0] = u[0] + w[1] * t[2] - w[2] * t[1] - 0.5 * kick * q[0];
+    v[1] = u[1] + w[2] * t[0] - w[0] * t[2] - 0.5 * kick * q[1];
+    v[2] = u[2] + w[0] * t[1] - w[1] * t[0] - 0.5 * kick * q[2];
+    NAME(boris_drift)(q, v, h);
+}
+
 /* Runs: the loops over lanes and time around a step. Lane `AT(b)` is the first of vector b. */
 
 #define AT(b) (first + (b) * LANES_OF_REAL)
@@ -703,6 +737,29 @@ INLINE void NAME(mirror_step)(REAL *q, REAL *p, double h, double kick)
                     NAME(system##_step)(q[b], p[b], h, h * eps);                                   \
             }                                                                                      \
             STORE_STATE(n, many, q1, p1)                                                           \
+        }                                                                                          \
+    }
+
+/* The same in q and v, with the half drifts of neighbouring steps as one. */
+#define DEFINE_BORIS_FINAL(many)                                                                   \
+    void NAME(boris_final)(long lanes, long steps, double h, double eps, const double *q0,         \
+                           const double *p0, double *q1, double *p1)                               \
+    {                                                                                              \
+        for (long first = 0; first < lanes; first += (many) * LANES_OF_REAL) {                     \
+            LOAD_STATE(3, many)                                                                    \
+            UNROLL for (int b = 0; b < (many); b++) {                                              \
+                NAME(boris_change)(q[b], p[b], -1.0);                                              \
+                NAME(boris_drift)(q[b], p[b], 0.5 * h);                                            \
+            }                                                                                      \
+            for (long k = 0; k < steps; k++) {                                                     \
+                UNROLL for (int b = 0; b < (many); b++)                                            \
+                    NAME(boris_step)(q[b], p[b], h, h * eps);                                      \
+            }                                                                                      \
+            UNROLL for (int b = 0; b < (many); b++) {                                              \
+                NAME(boris_drift)(q[b], p[b], -0.5 * h);                                           \
+                NAME(boris_change)(q[b], p[b], 1.0);                                               \
+            }                                                                                      \
+            STORE_STATE(3, many, q1, p1)                                                           \
         }                                                                                          \
     }
 
@@ -850,6 +907,7 @@ DEFINE_IMPLICIT(pendulum, 2, TOGETHER(1, 4),
 DEFINE_LOCKSTEP(pendulum_gauss, 2, TOGETHER(2, 2), 8)
 DEFINE_LOCKSTEP(pendulum_yoshida, 2, TOGETHER(4, 4), 5)
 DEFINE_EXPLICIT_FINAL(mirror, 3, TOGETHER(2, 8))
+DEFINE_BORIS_FINAL(TOGETHER(2, 8))
 
 #define CHAIN_STEP(n, coupling, solver)                                                            \
     NAME(chain_step)(n, coupling, solver, q[b], p[b], h, kick, iterations, &d)

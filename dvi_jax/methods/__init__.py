@@ -2,6 +2,7 @@
 
 from ._adjoint import Adjoint as Adjoint
 from ._base import InLoop as InLoop, Method as Method
+from ._charged import Boris as Boris, MagneticSplitting as MagneticSplitting
 from ._composition import Composition as Composition
 from ._dissipation import warn_of_dissipation as warn_of_dissipation
 from ._gauss_legendre import GaussLegendre as GaussLegendre

@@ -5,6 +5,7 @@ import re
 from typing import Any
 
 from ._adjoint import Adjoint
+from ._charged import Boris, MagneticSplitting
 from ._gauss_legendre import GaussLegendre
 from ._lobatto_pair import LobattoIIIAIIIB
 from ._published import BlanesMoan, KahanLi, McLachlan, Suzuki, Yoshida
@@ -29,6 +30,8 @@ def as_method(method: Any) -> Any:
         **dict.fromkeys(("TypeII", "SymplecticEuler"), TypeII),
         "Adjoint": Adjoint,
         **dict.fromkeys(("Strang", "StormerVerlet", "Verlet", "Leapfrog"), Strang),
+        "Boris": Boris,
+        "MagneticSplitting": MagneticSplitting,
         "Rattle": Rattle,
         "Splitting": Splitting,
         "WisdomHolman": WisdomHolman,
