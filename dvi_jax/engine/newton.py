@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
 import lanewise
+from lanewise.jaxprs.dependence import depends_on
 from lanewise.jaxprs.extent import primitives_in
 
 from ..base.checks import positive, whole
@@ -164,6 +165,16 @@ class Newton(RootSolver):
             error = jnp.stack([worst, size])
             return _Iterate(x, error, finite, is_accurate | is_round_off, state.iterations + 1)
 
+        if not depends_on(lambda x: value_and_jacobian(F, x)[1], 0, x0):
+            # One correction solves a linear equation; a second one shows how accurate that is.
+            value, jacobian = value_and_jacobian(F, x0)
+            x = x0 - lanewise.solve(jacobian, value)
+            last = lanewise.solve(jacobian, F(x))
+            x, last = x - last, jnp.abs(last)
+            scale = _larger(magnitude, jnp.abs(x))
+            worst, size = _largest_of(last), _largest_of(scale)
+            converged = worst <= 4096 * eps * size
+            return RootInfo(x, jnp.asarray(1, jnp.int32), jnp.stack([worst, size]), converged)
         by_rate = self.rtol is None and self.atol == 0
         yes, nans = jnp.asarray(True), jnp.full((2,), jnp.nan, x0.dtype)
         start = _Iterate(x0, nans, yes, ~yes, jnp.asarray(0, jnp.int32))
