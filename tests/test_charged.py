@@ -1,5 +1,7 @@
 """Explicit methods for charged particles: order, volume, symplecticity, fields by functions."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,7 +88,7 @@ def test_a_step_backwards_undoes_a_step(method):
 
 def test_the_speed_in_a_magnetic_field_alone_is_exact():
     drift = {"energy": dvi.MaxDrift(MIRROR.observables["energy"])}
-    run = {"num_steps": 20_000, "h": 0.5, "save": FINAL, "observe": drift}
+    run: Any = {"num_steps": 20_000, "h": 0.5, "save": FINAL, "observe": drift}
     assert dvi.integrate(MIRROR, method=dvi.Boris(), **run).observed["energy"] < 1e-12
     # Symplectic: the error does not grow; and it is there.
     short, long = (
@@ -98,6 +100,7 @@ def test_the_speed_in_a_magnetic_field_alone_is_exact():
 
 def test_uniform_fields_against_the_exact_solution():
     problem = systems.uniform_field()
+    assert problem.exact is not None
     q, p = problem.exact(jnp.asarray([2.0]), problem.q0, problem.p0, problem.args)
     exact = jnp.concatenate([q[0], p[0]])
     for method in (dvi.Boris(), dvi.MagneticSplitting(dvi.Yoshida(8))):
@@ -188,7 +191,7 @@ def test_gradients_and_batches():
 
 
 def test_compensated_sums_start_from_the_same_state():
-    run = {"h": 0.1, "num_steps": 100, "method": dvi.Boris(), "save": FINAL}
+    run: Any = {"h": 0.1, "num_steps": 100, "method": dvi.Boris(), "save": FINAL}
     plain = dvi.integrate(WAVES, Q, P, **run)
     other = dvi.integrate(WAVES, Q, P, arithmetic=dvi.Compensated(), **run)
     assert jnp.abs(plain.qs - other.qs).max() < 1e-12

@@ -69,7 +69,7 @@ class _Motion(NamedTuple):
         zero, n = jnp.zeros_like(q), q.shape[-1]
         units = [zero.at[..., i].set(1.0) for i in range(n)]
         # −A/m is the velocity for p = 0.
-        slopes = [jax.jvp(lambda q: self.velocity(t, q, zero), (q,), (e,))[1] for e in units]
+        slopes = [jax.jvp(lambda q: self.velocity(t, q, zero), (q,), (unit,))[1] for unit in units]
         pairs = [(0, 1)] if n == 2 else [(1, 2), (2, 0), (0, 1)]
         return jnp.stack([slopes[i][..., j] - slopes[j][..., i] for i, j in pairs], axis=-1)
 
@@ -81,8 +81,8 @@ class _Motion(NamedTuple):
     def at_rest(self, t: Scalar, q: State) -> State:
         """a at v = 0."""
         p = self.momentum(t, q, jnp.zeros_like(q))
-        _, induced = jax.jvp(lambda t: self.velocity(t, q, p), (t,), (jnp.ones_like(t),))
-        return induced + self.push(t, q)
+        _, induction = jax.jvp(lambda t: self.velocity(t, q, p), (t,), (jnp.ones_like(t),))
+        return induction + self.push(t, q)
 
     def friction(self, t: Scalar, q: State, v: State) -> State:
         """εW/m."""
@@ -101,11 +101,11 @@ class _Motion(NamedTuple):
         return a + (self.friction(t, q, v) - self.friction(t, q, jnp.zeros_like(v)))
 
 
-def _cross(c: Array, v: State) -> State:
-    """c × v; in the plane of an axis along which c is."""
+def _cross(turning: Array, v: State) -> State:
+    """The product with the vector `turning`; in a plane, with a vector normal to it."""
     if v.shape[-1] == 2:
-        return c * jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
-    return jnp.cross(c, v)
+        return turning * jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
+    return jnp.cross(turning, v)
 
 
 class _ChargedMethod(SplittingMethod):
@@ -139,9 +139,9 @@ class _ChargedMethod(SplittingMethod):
                 f"particle, but it is not that at the initial state with m = {mass.ravel()}."
             )
         # Of all particles together, from the equations of motion themselves.
-        _, carried = jax.jvp(lambda t, q: motion.velocity(t, q, p), (t, q), (jnp.ones_like(t), v))
+        _, transport = jax.jvp(lambda t, q: motion.velocity(t, q, p), (t, q), (jnp.ones_like(t), v))
         rate = motion.equations.momentum_rate(Interval(t, t, motion.zero), q, p)
-        if differ(motion.acceleration(t, q, v), carried + motion.inverse_mass * rate):
+        if differ(motion.acceleration(t, q, v), transport + motion.inverse_mass * rate):
             raise ValueError(
                 f"dvi.{name} requires that A at a particle depends on its own position only."
             )
@@ -178,9 +178,9 @@ def _middle(rate: Callable, h: Scalar, start: State, newton: RootSolver) -> tupl
         return v.reshape(start.shape), info
     # Linear: the columns of all particles at once, since none depends on another's velocity.
     units = [zero.at[..., i].set(1.0) for i in range(start.shape[-1])]
-    K = jnp.stack([jax.jvp(half, (zero,), (e,))[1] for e in units], axis=-1)
+    matrix = jnp.stack([jax.jvp(half, (zero,), (unit,))[1] for unit in units], axis=-1)
     solve = jnp.vectorize(lanewise.solve, signature="(n,n),(n)->(n)")
-    v = solve(jnp.eye(len(units), dtype=start.dtype) - K, start)
+    v = solve(jnp.eye(len(units), dtype=start.dtype) - matrix, start)
     return v, no_solve(v)
 
 
@@ -295,7 +295,8 @@ class MagneticSplitting(_ChargedMethod):
             raise ValueError(
                 "dvi.MagneticSplitting requires a force that does not depend on p: use dvi.Boris()."
             )
-        x, w = np.polynomial.legendre.leggauss(self.nodes)
+        nodes, weights = np.polynomial.legendre.leggauss(self.nodes)
+        fractions, weights = (1 + nodes) / 2, weights / 2
 
         def clock(interval, q, v):
             place, _ = equations.absolute(q, v)
@@ -305,14 +306,16 @@ class MagneticSplitting(_ChargedMethod):
             )
             return q, v, judge(no_solve(q), q, v)
 
-        def along(i, interval, q, v):
+        def axis_flow(i, interval, q, v):
             place, _ = equations.absolute(q, v)
             axis = np.arange(q.shape[-1]) == i
             path = jnp.where(axis, interval.h * v, 0.0)
-            places = (place + (0.5 + 0.5 * node) * path for node in x)
-            parts = zip(w, places, strict=True)
-            c = sum(0.5 * weight * motion.turning(interval.t0, here) for weight, here in parts)
-            v = v + _cross(c, path)
+            # A value at each node of the path, on which the field differs.
+            fields = [
+                motion.turning(interval.t0, place + fraction * path) for fraction in fractions
+            ]
+            turning = jnp.tensordot(jnp.asarray(weights, q.dtype), jnp.stack(fields), 1)
+            v = v + _cross(turning, path)
             return q + path, v, judge(no_solve(q), q, v)
 
         def kick(interval, q, v):
@@ -320,7 +323,7 @@ class MagneticSplitting(_ChargedMethod):
             v = v + interval.h * motion.push(interval.t0, place)
             return q, v, judge(no_solve(q), q, v)
 
-        flows = [*(partial(along, i) for i in range(q.shape[-1])), kick]
+        flows = [*(partial(axis_flow, i) for i in range(q.shape[-1])), kick]
         if depends_on(lambda t: motion.acceleration(t, q, q), 0, t0):
             flows = [clock, *flows]
         return [PartFlow(flow, True) for flow in flows]
