@@ -227,3 +227,14 @@ def test_other_systems_are_refused(H, shape, message):
             dvi.integrate(
                 dvi.System(dvi.discretise(H)), q, q + 0.5, h=0.1, num_steps=1, method=method
             )
+
+
+@pytest.mark.parametrize("method", [dvi.Boris(), dvi.MagneticSplitting()])
+def test_single_precision_stays_single(method):
+    q, p = Q.astype(jnp.float32), P.astype(jnp.float32)
+    sol = jax.eval_shape(
+        lambda q, p: dvi.integrate(WAVES, q, p, h=0.1, num_steps=1, method=method, throw=False),
+        q,
+        p,
+    )
+    assert sol.qs.dtype == sol.ps.dtype == jnp.float32
