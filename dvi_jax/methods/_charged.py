@@ -296,7 +296,8 @@ class MagneticSplitting(_ChargedMethod):
                 "dvi.MagneticSplitting requires a force that does not depend on p: use dvi.Boris()."
             )
         nodes, weights = np.polynomial.legendre.leggauss(self.nodes)
-        fractions, weights = (1 + nodes) / 2, weights / 2
+        # In the precision of the state: numbers of NumPy would make it double.
+        fractions, weights = (jnp.asarray(x, q.dtype) for x in ((1 + nodes) / 2, weights / 2))
 
         def clock(interval, q, v):
             place, _ = equations.absolute(q, v)
@@ -314,7 +315,7 @@ class MagneticSplitting(_ChargedMethod):
             fields = [
                 motion.turning(interval.t0, place + fraction * path) for fraction in fractions
             ]
-            turning = jnp.tensordot(jnp.asarray(weights, q.dtype), jnp.stack(fields), 1)
+            turning = jnp.tensordot(weights, jnp.stack(fields), 1)
             v = v + _cross(turning, path)
             return q + path, v, judge(no_solve(q), q, v)
 
