@@ -77,11 +77,12 @@ class Newton(RootSolver):
 
         x ← x − J⁻¹ F(x),    x ← x − J⁻¹ F(x),    (x ← x − J⁻¹ F(x)).
 
-    The ratio |δ'|/|δ| of the last two corrections estimates the rate of convergence. The iteration
-    stops once δ' times that rate is below round-off in each component, relative to the larger of
-    its known and unknown value; or, for components that are only round-off of larger ones, once
-    they are as small as that round-off and no longer shrink. So the root is accurate to round-off
-    also where J is not the derivative of F; the iteration is then longer. The order is 3 or 4.
+    A linear equation, whose J does not depend on x, needs no third one. The ratio |δ'|/|δ| of the
+    last two corrections estimates the rate of convergence. The iteration stops once δ' times that
+    rate is below round-off in each component, relative to the larger of its known and unknown
+    value; or, for components that are only round-off of larger ones, once they are as small as that
+    round-off and no longer shrink. So the root is accurate to round-off also where J is not the
+    derivative of F; the iteration is then longer. The order is 3 or 4.
 
     **Arguments**
 
@@ -107,6 +108,8 @@ class Newton(RootSolver):
     def solve(self, F, x0, scales):
         # In a loop in F trajectories of a batch wait for one another in any case.
         waits = self.is_nested or "while" in primitives_in(jax.make_jaxpr(F)(x0).jaxpr)
+        # The second correction of a linear equation is round-off already.
+        is_linear = not depends_on(lambda x: value_and_jacobian(F, x)[1], 0, x0)
         magnitude, eps = scales.size, float(jnp.finfo(x0.dtype).eps)
         tiny = float(jnp.finfo(x0.dtype).tiny)
 
@@ -133,7 +136,7 @@ class Newton(RootSolver):
                 return nearer, last, jnp.where(is_large, worst, previous)
 
             last = second
-            if x0.size <= _THIRD_UP_TO:
+            if x0.size <= _THIRD_UP_TO and not is_linear:
                 is_needed = lanewise.on_any(is_large, rare=x0.size > _FIRST_APART)
                 x, last, previous = lax.cond(is_needed, third, lambda: (x, second, previous))
             worst = _largest_of(jnp.abs(last))
@@ -165,16 +168,6 @@ class Newton(RootSolver):
             error = jnp.stack([worst, size])
             return _Iterate(x, error, finite, is_accurate | is_round_off, state.iterations + 1)
 
-        if not depends_on(lambda x: value_and_jacobian(F, x)[1], 0, x0):
-            # One correction solves a linear equation; a second one shows how accurate that is.
-            value, jacobian = value_and_jacobian(F, x0)
-            x = x0 - lanewise.solve(jacobian, value)
-            last = lanewise.solve(jacobian, F(x))
-            x, last = x - last, jnp.abs(last)
-            scale = _larger(magnitude, jnp.abs(x))
-            worst, size = _largest_of(last), _largest_of(scale)
-            converged = worst <= 4096 * eps * size
-            return RootInfo(x, jnp.asarray(1, jnp.int32), jnp.stack([worst, size]), converged)
         by_rate = self.rtol is None and self.atol == 0
         yes, nans = jnp.asarray(True), jnp.full((2,), jnp.nan, x0.dtype)
         start = _Iterate(x0, nans, yes, ~yes, jnp.asarray(0, jnp.int32))
