@@ -54,12 +54,12 @@ def test_the_order_in_a_field_of_place_and_time(method, order):
 
 
 def matrix(method, system=WAVES):
-    """The derivative of three steps with respect to (q, p)."""
+    """The derivative of a step with respect to (q, p)."""
 
-    def steps(z):
-        return end(system, z[:3], z[3:], method, 0.2, 3, throw=False)
+    def step(z):
+        return end(system, z[:3], z[3:], method, 0.2, 1, throw=False)
 
-    return np.asarray(jax.jacfwd(steps)(jnp.concatenate([Q, P])))
+    return np.asarray(jax.jacfwd(step)(jnp.concatenate([Q, P])))
 
 
 def test_boris_preserves_volume_and_the_splitting_the_symplectic_form():
@@ -68,11 +68,16 @@ def test_boris_preserves_volume_and_the_splitting_the_symplectic_form():
     def defect(D):
         return np.abs(D.T @ J @ D - J).max()
 
-    boris, splitting = matrix(dvi.Boris()), matrix(dvi.MagneticSplitting(nodes=8))
-    assert abs(np.linalg.det(boris) - 1) < 1e-13 < 1e-4 < defect(boris)
+    boris, splitting = matrix(dvi.Boris()), matrix(dvi.MagneticSplitting(nodes=4))
+    assert abs(np.linalg.det(boris) - 1) < 1e-13 < 1e-5 < defect(boris)
     assert defect(splitting) < 1e-13
-    # Few nodes are not exact in this field, and the defect shows it.
-    assert defect(matrix(dvi.MagneticSplitting(nodes=1))) > 1e-10
+
+
+@pytest.mark.slow
+def test_few_nodes_are_not_symplectic_in_this_field():
+    J = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.eye(3), np.zeros((3, 3))]])
+    D = matrix(dvi.MagneticSplitting(nodes=1))
+    assert np.abs(D.T @ J @ D - J).max() > 1e-10
 
 
 @pytest.mark.parametrize("method", [dvi.Boris(), dvi.MagneticSplitting()])
@@ -135,7 +140,7 @@ def test_fields_given_by_functions():
     assert jnp.abs(first[:3] - second[:3]).max() < 1e-13
 
 
-@pytest.mark.parametrize("power", [1, 3])
+@pytest.mark.parametrize("power", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_frictions_have_order_two(power):
     """A friction −v is linear and has no iteration; −|v|² v is solved for."""
 
@@ -150,6 +155,7 @@ def test_frictions_have_order_two(power):
         dvi.integrate(system, Q, P, h=0.1, num_steps=5, epsilon=0.7, method=dvi.MagneticSplitting())
 
 
+@pytest.mark.slow
 def test_particles_that_interact_and_the_plane():
     def H(t, q, p, args):
         A = args["B"] / 2 * jnp.stack([-q[:, 1], q[:, 0]], axis=1)
@@ -165,18 +171,21 @@ def test_particles_that_interact_and_the_plane():
         assert abs(slopes(system, q, p, method, 60, T=0.6, args=args) - 2) < 0.25
 
 
-def test_gradients_and_batches():
-    def loss(B0, method):
+@pytest.mark.parametrize(
+    "method", [dvi.Boris(), pytest.param(dvi.MagneticSplitting(), marks=pytest.mark.slow)]
+)
+def test_gradients(method):
+    def loss(B0):
         args = MIRROR.args | {"B0": B0}
         q0, p0 = jnp.asarray(MIRROR.q0), jnp.asarray(MIRROR.p0)
         return jnp.sum(end(MIRROR.system, q0, p0, method, 0.1, 40, args=args, throw=False) ** 2)
 
-    for method in (dvi.Boris(), dvi.MagneticSplitting()):
-        value = jax.grad(loss)(1.0, method)
-        step = 1e-4
-        difference = (loss(1 + step, method) - loss(1 - step, method)) / (2 * step)
-        assert abs(value - difference) < 1e-6 * abs(difference)
+    step = 1e-4
+    difference = (loss(1 + step) - loss(1 - step)) / (2 * step)
+    assert abs(jax.grad(loss)(1.0) - difference) < 1e-6 * abs(difference)
 
+
+def test_a_particle_has_the_same_bits_alone_and_in_a_batch():
     @jax.jit
     @jax.vmap
     def run(B0):
