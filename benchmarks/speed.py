@@ -369,7 +369,7 @@ def table() -> list[Row]:
     for name, title in (("pendulum_gauss", "GaussLegendre(2)"), ("pendulum_yoshida", "Yoshida(4)")):
         add(f"double pendulum, {title}", 2.0, batch_row, name=name, lanes=16384, steps=40)
     add("charged particle in a mirror", 2.0, batch_row, name="mirror", steps=200, **many)
-    add("the same by Boris", 1.5, batch_row, name="boris", steps=200, **many)
+    add("charged particle in a mirror, Boris", 1.5, batch_row, name="boris", steps=200, **many)
 
     add("one trajectory, kepler", 1.2, one_row, name="kepler", steps=400_000)
     for name, title in (("product", "n = 1"), ("pendulum", "double pendulum"), ("chain2", "chain")):
