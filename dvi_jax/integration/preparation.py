@@ -25,7 +25,7 @@ from ..observe.solution import Solution
 from ..problem.noise import BrownianPath
 from ..problem.system import System
 from .adjoints import AbstractAdjoint
-from .checks import check_memory, check_observe, noise_path
+from .checks import check_jumps, check_memory, check_observe, noise_path
 from .dense import requested_times
 from .integrator import Integrator
 from .task import Plan, Task, make_plan
@@ -146,5 +146,7 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
 
     kind = type(arithmetic)
     equations, q0, p0 = kind.prepare(arithmetic, method, equations, first_interval, run.q0, run.p0)
-    task = Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop)
+    task = Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop, run.jumps)
+    if run.jumps:
+        task = check_jumps(task, run.save, q0, p0)
     return task, q0, p0
