@@ -288,7 +288,11 @@ def _next_jump(
     # A state within the step that cannot be computed ends the run.
     failed = part._replace(info=part.info.then(info))
     has_failed = exists & ~is_blocked & ~has_jump
-    chosen = where(has_jump, new_part, where(has_failed, failed, part))
+    # A surface that was passed at the last jump: nothing remains to be done in this part.
+    settled = [jnp.where(wait, 0.0, x) for wait, x in zip(waits, part.quiet, strict=True)]
+    passed = part._replace(before=starts, quiet=settled)
+    chosen = where(has_failed, failed, where(is_due & ~exists, passed, part))
+    chosen = where(has_jump, new_part, chosen)
     status = RESULTS.where(is_blocked, RESULTS.not_returned, RESULTS.successful)
     record = Record(is_made, index, t, q, p, q_new, p_new)
     return _judged(chosen, status), record
