@@ -81,8 +81,8 @@ class RESULTS(eqx.Enumeration):
         "dvi.rings.track also reports the element."
     )
     event_not_finite = (
-        "The function g of dvi.Stop, dvi.Section or dvi.Jump became NaN at a state of the trajectory. Give "
-        "it a value at all states, for example with jnp.where."
+        "The function g of dvi.Stop, dvi.Section or dvi.Jump became NaN at a state of the "
+        "trajectory. Give it a value at all states, for example with jnp.where."
     )
     not_returned = (
         "The trajectory is at g ≥ 0 of a dvi.Jump that must send it back to g < 0. Likely causes: "

@@ -76,7 +76,7 @@ def check_observe(task: Task, q0: Array, p0: Array) -> tuple[int, int]:
     return at_save, of_reductions
 
 
-def check_jumps(task: Task, save: Save, q0: Array, p0: Array) -> Task:
+def check_jumps(task: Task, request: Run, q0: Array, p0: Array) -> Task:
     """The task, which knows whether a jump changes args. **Raises** `ValueError` or `TypeError` for
     jumps that cannot be made, or not together with its other options."""
     point = task.t0, q0, p0, task.args
@@ -95,10 +95,12 @@ def check_jumps(task: Task, save: Save, q0: Array, p0: Array) -> Task:
             hint = "Return all parameters of the run."
             one_of("shapes of args of map of Jump", shapes[0], shapes[1:], hint)
             task = dataclasses.replace(task, changes_args=True)
-    _, reductions = task.observables()
-    functions = [r.function for r in reductions if not isinstance(r, Deviations | KeptSteps)]
-    functions += task.observables()[0]
-    has_points = save.ts is not None or any(isinstance(r, KeptSteps) for r in reductions)
+    leaves = jax.tree.leaves(request.observe, is_leaf=is_observable)
+    leaves = [leaf.reduction if isinstance(leaf, Running) else leaf for leaf in leaves]
+    functions = [getattr(x, "function", x) if isinstance(x, Reduction) else x for x in leaves]
+    pairs = zip(leaves, functions, strict=True)
+    others = [f for leaf, f in pairs if not isinstance(leaf, Deviations | KeptSteps)]
+    has_points = request.save.ts is not None or any(isinstance(x, KeptSteps) for x in leaves)
     system = task.equations.system
     refuse_first(
         {
@@ -116,7 +118,7 @@ def check_jumps(task: Task, save: Save, q0: Array, p0: Array) -> Task:
             ),
             "jump cannot be used with an observable of a step, whose ends would lie on both sides "
             "of a jump: observe functions (q, p) or (t, q, p, args).": (
-                not all(map(has_initial_value, functions))
+                not all(map(has_initial_value, others))
             ),
             "a Jump that changes args cannot be used with dvi.Section, dvi.Save(ts=...) or "
             "deviation vectors: let map return (q, p), or save steps with dvi.Save(every=m).": (

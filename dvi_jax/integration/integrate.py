@@ -141,14 +141,18 @@ def integrate(
     ```
     """
     refuse_unknown("integrate", integrate, unknown)
-    problem, (system, q0, p0, default_h, args) = system, of_problem(system, q0, p0, h, args)
+    problem, (system, q0, p0, default_h, args) = (
+        system,
+        of_problem(system, q0, p0, h, args, jumps_allowed=True),
+    )
     check_system(system, noise_allowed=True)
     options = {"method": method, "lattice": lattice, "adjoint": adjoint, "newton": newton}
     options |= {"root_finder": root_finder, "arithmetic": arithmetic, "layout": layout}
     integrator = chosen(integrator, **options)
     instance("save", save, Save, "a dvi.Save(...)", _save_hint(save))
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
-    jumps = tuple(jump) if isinstance(jump, list | tuple) else () if jump is None else (jump,)
+    jumps = tuple(jump) if isinstance(jump, list | tuple) else (jump,)
+    jumps = getattr(problem, "jumps", ()) if jump is None else jumps
     for each in jumps:
         instance("jump", each, Jump, "a dvi.Jump(g, map), or a list of them")
     q0, p0 = start_state(q0, p0)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import lanewise
 
 from ..base.results import RESULTS, first_failure
 from ..base.types import Args, Interval, Scalar, State
-from ..engine.bracket import bracketed_root
+from ..engine.bracket import bracketed_root, divide
 from ..methods.step import Equations, StepInfo, info_of
 from ..observe import Jump, Jumps
 from ..observe._kept import event
@@ -22,12 +23,16 @@ from .task import Ends, Task
 MOST = 8
 """Maximum number of jumps in one step."""
 
+_ROUNDS = 50
+"""Maximum number of evaluations of a search for a maximum of g."""
+
 
 class JumpMemory(NamedTuple):
-    """What the loop carries: g of each jump before the step, ∞ where its first part is ignored;
-    the number of jumps, and their rows."""
+    """What the loop carries: g of each jump before the step, ∞ where its first part is ignored, and
+    dg/dt; the number of jumps, and their rows."""
 
     before: list[Scalar]
+    slopes: list[Scalar]
     count: Int[Array, ""]
     rows: Array | None
 
@@ -35,8 +40,9 @@ class JumpMemory(NamedTuple):
 class Part(NamedTuple):
     """The part of a step after its last jump, which begins at a fraction of the step.
 
-    `before`, `after`: g of each jump at its start and end. `quiet`: fraction of the step up to
-    which g is ignored. `is_over`: whether a `Stop` ends the run at (t1, q1, p1).
+    `before`, `after`: g of each jump at its start and end; `rises`, `falls`: dg/dt there, 0 where
+    it does not matter any more. `quiet`: fraction of the step up to which g is ignored. `is_over`:
+    whether a `Stop` ends the run at (t1, q1, p1).
     """
 
     fraction: Scalar
@@ -48,6 +54,8 @@ class Part(NamedTuple):
     p1: State
     before: list[Scalar]
     after: list[Scalar]
+    rises: list[Scalar]
+    falls: list[Scalar]
     quiet: list[Scalar]
     args: Args
     info: StepInfo
@@ -80,23 +88,23 @@ def first_memory(task: Task, q: State) -> JumpMemory:
     capacity = sum(jump.capacity for jump in task.jumps)
     rows = jnp.full((capacity, 2 + 4 * q.size), jnp.nan, q.dtype) if capacity else None
     zero = jnp.asarray(0, jnp.int32)
-    return JumpMemory([jnp.asarray(jnp.inf, q.dtype)] * len(task.jumps), zero, rows)
+    before, slopes = ([jnp.asarray(x, q.dtype)] * len(task.jumps) for x in (jnp.inf, 0))
+    return JumpMemory(before, slopes, zero, rows)
 
 
 def with_jumps(
-    task: Task, equations: Equations, interval: Interval, before: list[Scalar], step: tuple
+    task: Task, equations: Equations, interval: Interval, memory: JumpMemory, step: tuple
 ) -> tuple[Part, Record | None]:
     """The part of a step after its last jump, and the records of its jumps if they are needed;
     `step` is (q0, p0, q1, p1, info) without jumps."""
     q0, p0, q1, p1, info = step
     args, zero = equations.args if task.changes_args else None, jnp.zeros_like(interval.t0)
-    after = _values(task, interval.t1, q1, p1, args)
-    quiet = [jnp.where(jnp.isinf(x), _quiet(q0), 0.0) for x in before]
+    after, falls = _with_slopes(task, equations, interval.t1, q1, p1)
+    quiet = [jnp.where(jnp.isinf(x), _quiet(q0), 0.0) for x in memory.before]
     part = Part(
-        *(zero, interval.t0, q0, p0, interval.t1, q1, p1, before, after, quiet, args),
-        _with_nan(info, after),
-        jnp.asarray(False),
-        jnp.asarray(0, jnp.int32),
+        *(zero, interval.t0, q0, p0, interval.t1, q1, p1),
+        *(memory.before, after, memory.slopes, falls, quiet, args, _with_nan(info, after)),
+        *(jnp.asarray(False), jnp.asarray(0, jnp.int32)),
     )
     advance = functools.partial(_next_jump, task, equations, interval)
     has_records = task.records_jumps
@@ -106,25 +114,30 @@ def with_jumps(
         return part, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), zeros)
 
     def round_of(part, _):
-        part, record = lax.cond(lanewise.on_any(_is_due(task, part)), advance, no_jump, part)
+        part, record = lax.cond(
+            lanewise.on_any(_is_due(task, interval, part)), advance, no_jump, part
+        )
         return part, record if has_records else None
 
     def jumps(part):
         part, records = lax.scan(round_of, part, None, MOST)
-        status = RESULTS.where(_is_due(task, part), RESULTS.too_many_jumps, RESULTS.successful)
+        status = RESULTS.where(
+            _is_due(task, interval, part), RESULTS.too_many_jumps, RESULTS.successful
+        )
         return _judged(part, status), records
 
     def none(part):
         records = jax.eval_shape(lambda part: jumps(part)[1], part)
         return part, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), records)
 
-    return lax.cond(lanewise.on_any(_is_due(task, part)), jumps, none, part)
+    return lax.cond(lanewise.on_any(_is_due(task, interval, part)), jumps, none, part)
 
 
-def values_after(part: Part) -> list[Scalar]:
-    """g of each jump at the end of the step."""
+def after_step(memory: JumpMemory, part: Part) -> JumpMemory:
+    """The memory with g of each jump at the end of the step."""
     pairs = zip(part.after, part.quiet, strict=True)
-    return [jnp.where(quiet >= 1, jnp.inf, value) for value, quiet in pairs]
+    before = [jnp.where(quiet >= 1, jnp.inf, value) for value, quiet in pairs]
+    return memory._replace(before=before, slopes=part.falls)
 
 
 def with_row(memory: JumpMemory, record: Record) -> JumpMemory:
@@ -156,6 +169,82 @@ def _values(task: Task, t: Scalar, q: State, p: State, args: Args) -> list[Scala
     return [event(jump.g, t, q, p, args, "g of Jump") for jump in task.jumps]
 
 
+def _with_slopes(
+    task: Task, equations: Equations, t: Scalar, q: State, p: State
+) -> tuple[list[Scalar], list[Scalar]]:
+    """g of each jump at a point, and dg/dt along the motion, without a derivative."""
+    point, args = (t, q, p), equations.args
+    rates = jnp.ones_like(t), *equations.rates(Interval(t, t, jnp.zeros_like(t)), q, p)
+    pairs = [
+        jax.jvp(lambda *point, g=jump.g: event(g, *point, args, "g of Jump"), point, rates)
+        for jump in task.jumps
+    ]
+    values, slopes = map(list, zip(*pairs, strict=True))
+    return values, lax.stop_gradient(slopes)
+
+
+def _peak(a: Scalar, rise: Scalar, b: Scalar, fall: Scalar) -> tuple[Scalar, Array]:
+    """Where between 0 and 1 the tangents at the ends meet, and whether a concave g, which is
+    below them, may be positive although it is negative at the ends."""
+    theta = (b - fall - a) / (rise - fall)
+    is_possible = (rise > 0) & (fall < 0) & (a < 0) & (b < 0) & (a + rise * theta >= 0)
+    return theta, is_possible
+
+
+def _peaks(interval: Interval, part: Part) -> list[Array]:
+    """Whether g of each jump may be positive within the part, but not at its ends."""
+    length = (1 - part.fraction) * interval.h
+    rows = zip(part.before, part.rises, part.after, part.falls, part.quiet, strict=True)
+    return [
+        _peak(a, length * rise, b, length * fall)[1] & (quiet <= part.fraction)
+        for a, rise, b, fall, quiet in rows
+    ]
+
+
+def _highest(evaluate: Callable, part: Part, length: Scalar, flags: list[Array]) -> Any:
+    """For each jump with a flag a point of the part where g ≥ 0, if there is one, and g there; else
+    its end. `evaluate` returns g and dg/dt of all jumps at a fraction of the part."""
+    unit = jnp.ones_like(length)
+    brackets = [
+        (0 * unit, a, length * rise, unit, b, length * fall)
+        for a, rise, b, fall in zip(part.before, part.rises, part.after, part.falls, strict=True)
+    ]
+
+    def meets(flag, bracket):
+        low, a, rise, high, b, fall = bracket
+        width = high - low
+        theta, is_possible = _peak(a, rise * width, b, fall * width)
+        return low + theta * width, flag & is_possible & (width > jnp.finfo(b.dtype).eps)
+
+    def proceeds(state):
+        n, brackets = state
+        return (n < _ROUNDS) & _any(meets(*x)[1] for x in zip(flags, brackets, strict=True))
+
+    def narrow(state):
+        n, brackets = state
+        theta = unit
+        for flag, bracket in zip(flags, brackets, strict=True):
+            here, is_open = meets(flag, bracket)
+            theta = jnp.where(is_open, here, theta)
+        values, slopes = evaluate(theta)
+        new = []
+        for bracket, value, slope in zip(brackets, values, slopes, strict=True):
+            low, _, _, high, b, _ = bracket
+            point = theta, value, slope * length
+            is_inside = (low < theta) & (theta < high) & (b < 0)
+            is_right = (value >= 0) | (slope * length <= 0)
+            left = where(is_inside & ~is_right, point, bracket[:3])
+            new.append((*left, *where(is_inside & is_right, point, bracket[3:])))
+        return n + 1, new
+
+    def search(_, x):
+        _, ends = lax.while_loop(proceeds, narrow, (0, brackets))
+        return x, ([bracket[3] for bracket in ends], [bracket[4] for bracket in ends])
+
+    # A root of nothing: what its search returns next to it has no derivative.
+    return lanewise.implicit_root(lambda x: x, 0 * unit, search, divide)[1]
+
+
 def _with_nan(info: StepInfo, values: list[Scalar]) -> StepInfo:
     is_nan = _any(jnp.isnan(x) for x in values)
     status = RESULTS.where(is_nan, RESULTS.event_not_finite, RESULTS.successful)
@@ -175,7 +264,7 @@ def _waits(part: Part) -> list[Array]:
     return [(quiet > part.fraction) & (quiet < 1) for quiet in part.quiet]
 
 
-def _is_due(task: Task, part: Part) -> Array:
+def _is_due(task: Task, interval: Interval, part: Part) -> Array:
     """Whether there may be a jump in the part, or its end must not be reached."""
     flags = []
     each = zip(task.jumps, part.before, part.after, part.quiet, _waits(part), strict=True)
@@ -183,6 +272,7 @@ def _is_due(task: Task, part: Part) -> Array:
         is_above = (after >= 0) & (quiet < 1)
         flags.append(is_above if jump.returns else is_above & ((before < 0) | waits))
     is_good = part.info.result == RESULTS.successful
+    flags += _peaks(interval, part)
     return _any(flags) & is_good & ~part.is_over
 
 
@@ -190,7 +280,7 @@ def _next_jump(
     task: Task, equations: Equations, interval: Interval, part: Part
 ) -> tuple[Part, Record]:
     """The part after the first jump in this one, and the record of it."""
-    is_due, waits = _is_due(task, part), _waits(part)
+    is_due, waits = _is_due(task, interval, part), _waits(part)
     equations = _with_args(task, equations, part.args)
     length = (1 - part.fraction) * interval.h
 
@@ -212,7 +302,18 @@ def _next_jump(
 
     values = lax.cond(lanewise.on_any(has_probe), at_probe, lambda x: x, part.before)
     starts = [jnp.where(*x) for x in zip(waits, values, part.before, strict=True)]
-    each = zip(starts, part.after, part.quiet, strict=True)
+    peaks = [is_due & flag for flag in _peaks(interval, part)]
+
+    def evaluate(theta):
+        return _with_slopes(task, equations, *point(theta)[0])
+
+    def no_peak(_):
+        return [unit] * len(peaks), part.after
+
+    tops, at_tops = lax.cond(
+        lanewise.on_any(_any(peaks)), lambda _: _highest(evaluate, part, length, peaks), no_peak, 0
+    )
+    each = zip(starts, at_tops, part.quiet, strict=True)
     candidates = [is_due & (x < 0) & (y >= 0) & (quiet < 1) for x, y, quiet in each]
     exists = _any(candidates)
 
@@ -225,13 +326,16 @@ def _next_jump(
         return largest, index
 
     def values_at(theta, point):
-        each = zip(waits, starts, _values(task, *point, part.args), strict=True)
-        return [jnp.where(wait & (theta < probe), x, y) for wait, x, y in each]
+        each = zip(waits, starts, tops, at_tops, _values(task, *point, part.args), strict=True)
+        return [
+            jnp.where(wait & (theta < probe), x, jnp.where(theta > end, z, y))
+            for wait, x, end, z, y in each
+        ]
 
     def first_of_all(theta):
         return largest(values_at(theta, point(theta)[0]))[0]
 
-    at_ends = largest(starts)[0], largest(part.after)[0]
+    at_ends = largest(starts)[0], largest(at_tops)[0]
     theta = bracketed_root(first_of_all, 0 * unit, at_ends[0], unit, at_ends[1], exists)
     (t, q, p), info = point(theta)
     reached = values_at(theta, (t, q, p))
@@ -269,18 +373,16 @@ def _next_jump(
     end = interval.t1, q1, p1
     is_over = jnp.asarray(stops[0]) | stops[1]
     end = where(is_over, (t, *where(jnp.asarray(stops[1]), (q_new, p_new), (q, p))), end)
-    before = _values(task, *start[1:], args)
+    before, rises = _with_slopes(task, equations, *start[1:])
     # Of jumps at one time one is made first; the others have g = 0 up to rounding.
     below = -jnp.finfo(value.dtype).tiny
     for i, (is_candidate, x) in enumerate(zip(candidates, before, strict=True)):
         is_next = is_candidate & (index != i) & (x >= 0) & (x <= value)
         before[i] = jnp.where(is_next, below, x)
-    quiet = [
-        jnp.where(index == i, fraction + _quiet(q), x) for i, x in enumerate(part.quiet)
-    ]
-    after = _values(task, interval.t1, q1, p1, args)
+    quiet = [jnp.where(index == i, fraction + _quiet(q), x) for i, x in enumerate(part.quiet)]
+    after, falls = _with_slopes(task, equations, interval.t1, q1, p1)
     new_part = Part(
-        *(*start, *end, before, after, quiet, args),
+        *(*start, *end, before, after, rises, falls, quiet, args),
         _with_nan(part.info.then(info).then(last), [*reached, *before, *after]),
         is_over,
         part.count + is_made,
@@ -290,7 +392,8 @@ def _next_jump(
     has_failed = exists & ~is_blocked & ~has_jump
     # A surface that was passed at the last jump: nothing remains to be done in this part.
     settled = [jnp.where(wait, 0.0, x) for wait, x in zip(waits, part.quiet, strict=True)]
-    passed = part._replace(before=starts, quiet=settled)
+    rises = [jnp.where(flag, 0.0, x) for flag, x in zip(peaks, part.rises, strict=True)]
+    passed = part._replace(before=starts, quiet=settled, rises=rises)
     chosen = where(has_failed, failed, where(is_due & ~exists, passed, part))
     chosen = where(has_jump, new_part, chosen)
     status = RESULTS.where(is_blocked, RESULTS.not_returned, RESULTS.successful)

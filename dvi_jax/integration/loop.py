@@ -23,7 +23,7 @@ from ..methods.constraint import start_status
 from ..methods.step import info_of
 from ..observe import Deviations, Pushed, Reduction, has_initial_value
 from ..observe._kept import KeptSteps, StepStart, as_row, event
-from .jumps import JumpMemory, Part, Record, first_memory, values_after, where, with_jumps, with_row
+from .jumps import Part, Record, after_step, first_memory, where, with_jumps, with_row
 from .task import Carry, Ends, Outcome, Plan, Rows, Task, adds_start_outside, or_nan
 
 Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
@@ -122,7 +122,7 @@ def take_step(
         info = info_of(task.method, info, q1, p1)
         if task.jumps:
             whole = q, p, q1, p1, info
-            jumped = with_jumps(task, equations, interval, carry.jumps.before, whole)
+            jumped = with_jumps(task, equations, interval, carry.jumps, whole)
             part, _ = jumped
             return (part.q1, part.p1, None), (remainder, part.info, jumped)
         if conversion is None:
@@ -178,7 +178,7 @@ def take_step(
         remainder=remainder,
         stop=stop,
     )
-    return new, interval, ends
+    return new, interval, Ends(*interval[:2], carry.q, carry.p, new.q, new.p)
 
 
 def _after_jumps(
@@ -186,7 +186,7 @@ def _after_jumps(
 ) -> tuple[Carry, Carry]:
     """The carries before and after a step, with its jumps, and the parts of the step before them in
     the reductions that keep steps."""
-    memory: JumpMemory = carry.jumps._replace(before=values_after(part))
+    memory = after_step(carry.jumps, part)
     if records is None:
         return carry, new._replace(jumps=memory._replace(count=memory.count + part.count))
     _, reductions = task.observables()
@@ -300,9 +300,7 @@ def _deviations(push: Callable, vectors: Array, ends: Ends, h: Scalar) -> Pushed
     return Pushed(or_nan(good, jax.vmap(push_flat)(vectors)), h)
 
 
-def _stop(
-    task: Task, carry: Carry, last: Ends, result: RESULTS
-) -> tuple[RESULTS, Any]:
+def _stop(task: Task, carry: Carry, last: Ends, result: RESULTS) -> tuple[RESULTS, Any]:
     """The status and the stored row, after a step that may meet the condition of a `Stop`."""
     if task.stop is None:
         return result, None

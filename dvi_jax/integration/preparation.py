@@ -82,6 +82,8 @@ def prepare(
     image, undo = type(lattice).transform(lattice, run)
     type(lattice).check(lattice, method, integrator.arithmetic)
     task, q0, p0 = _task(image, integrator, method, h)
+    if run.jumps:
+        task = check_jumps(task, run, q0, p0)
     if noise is not None:
         task = dataclasses.replace(task, path=noise)
     plan = make_plan(run.save, num_steps)
@@ -147,6 +149,4 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
     kind = type(arithmetic)
     equations, q0, p0 = kind.prepare(arithmetic, method, equations, first_interval, run.q0, run.p0)
     task = Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop, run.jumps)
-    if run.jumps:
-        task = check_jumps(task, run.save, q0, p0)
     return task, q0, p0

@@ -36,8 +36,10 @@ class Jump(eqx.Module):
     Derivatives contain the change of the time of the jump (saltation), also those of `Lyapunov`
     exponents and other deviation vectors. `Reversible` works as `Checkpointed`.
 
-    **Limits** The steps must resolve g: if it becomes positive and negative again within one step,
-    no jump happens. After a jump its g is ignored for a fraction of a step, 5.5e-7 in float64 and
+    **Limits** The steps must resolve g. If it is positive within a step, but negative at its ends,
+    the jump is made where g is concave in time: dg/dt at the ends shows it. Else it is missed. The
+    surface of a `Section` must be another than that of the jump, where it is zero up to rounding.
+    After a jump its g is ignored for a fraction of a step, 5.5e-7 in float64 and
     1.7e-3 in float32, in which it is zero up to rounding; so it is at the start of a run. More than
     8 jumps in one step end the run with the status `too_many_jumps`, for instance where the bounces
     of a ball accumulate. At a point where two surfaces meet, the derivative is that of the order in
