@@ -115,7 +115,9 @@ def main(arguments=None):
             _, q_c, p_c = call(name, 1, options.h, 12)()
             np.testing.assert_allclose(q, q_c[0], atol=1e-9)
             np.testing.assert_allclose(p, p_c[0], atol=1e-9)
-        print(f"{'trajectories':>12} {'C program':>10} {'reflections':>12} {'ns each':>8} {'× C':>6}")
+        print(
+            f"{'trajectories':>12} {'C program':>10} {'reflections':>12} {'ns each':>8} {'× C':>6}"
+        )
         for lanes in (1, LANES):
             steps = round(options.reflections / lanes * 0.9 / options.h)
             mine = ours(lanes, options.h, steps)

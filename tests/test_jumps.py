@@ -9,6 +9,7 @@ import pytest
 from helpers import central_difference
 
 import dvi_jax as dvi
+from dvi_jax import systems
 
 FREE = dvi.System(lambda t0, t1, q, p, args: p @ p / 2)
 BALL = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q[0])
@@ -390,3 +391,67 @@ def test_deviation_vectors_contain_the_change_of_the_times():
     exact = jnp.stack(jax.jacobian(last, (0, 1))(1.0, 0.0), axis=1)
     np.testing.assert_allclose(sol.observed, exact, atol=1e-12)
     assert abs(np.linalg.det(exact) - 0.64) < 1e-12  # r²: one factor r by p, one by the saltation
+
+
+# --- systems of the library -----------------------------------------------------------------------
+
+
+def growth(jumps, count, focus):
+    """Σ ln |stretching| of a displacement and an angle along the recorded reflections: a free
+    flight adds angle × time to the displacement, a wall changes the angle by `focus`."""
+    shift, angle, t, total = 1.0, 0.3, 0.0, 0.0
+    rows = (jumps.ts, jumps.index, jumps.qs_before, jumps.ps_before)
+    for time, i, q, p in zip(*(np.asarray(x[:count]) for x in rows), strict=True):
+        shift += angle * (time - t)
+        angle += focus(i, q, p) * shift
+        size, t = np.hypot(shift, angle), time
+        total += np.log(size)
+        shift, angle = shift / size, angle / size
+    return total / t
+
+
+def at_disc(i, q, p):
+    return 2 / -(q @ p) if i == 0 else 0.0  # 2/(R cos φ)
+
+
+def at_caps(i, q, p):
+    return -2 / (p @ (q - [np.sign(q[0]), 0])) if abs(q[0]) > 1 else 0.0
+
+
+@slow
+@pytest.mark.parametrize(("name", "focus"), [("sinai_billiard", at_disc), ("stadium", at_caps)])
+def test_lyapunov_exponents_of_billiards_are_those_of_their_geometry(name, focus):
+    """Sinai's formula, with curvatures by hand; the control has no curvature at the walls."""
+    made = getattr(systems, name)(max_jumps=10_000)
+    observe = dvi.LyapunovSpectrum(4)
+    sol = dvi.integrate(made, num_steps=10_000, observe=observe, save=dvi.Save(final=True))
+    count = int(sol.jumps.count)
+    first = growth(sol.jumps, count, focus)
+    np.testing.assert_allclose(sol.observed[0], first, atol=1e-3)
+    np.testing.assert_allclose(sol.observed[:2], -sol.observed[::-1][:2], atol=1e-3)
+    assert abs(sol.observed[0] - growth(sol.jumps, count, lambda *_: 0.0)) > 0.3
+    np.testing.assert_allclose(np.sum(np.asarray(sol.p_final) ** 2), 1.0, rtol=1e-11)
+    # Within the table: no reflection was missed.
+    assert np.max(np.abs(sol.jumps.qs_before[:count])) < 2 + 1e-12
+
+
+def test_a_problem_with_jumps_is_run_with_them_or_refused():
+    ball = systems.bouncing_ball(0.8)
+    sol = dvi.integrate(ball, num_steps=60, method="strang")
+    np.testing.assert_allclose(sol.jumps.ts[:3], bounces(0.8, 3)[0], atol=1e-13)
+    assert dvi.integrate(ball, num_steps=60, method="strang", jump=[]).jumps is None
+    for call in (
+        lambda: dvi.sweep(ball, h=0.1, num_steps=10, observe={"q": dvi.Last(lambda q, p: q)}),
+        lambda: dvi.explore(ball),
+        lambda: dvi.interop.solve_ivp(ball, (0, 1), [1.0, 0.0], h=0.1),
+    ):
+        with pytest.raises(ValueError, match="Only dvi.integrate makes jumps"):
+            call()
+
+
+def test_a_solution_with_jumps_in_a_file(tmp_path):
+    sol = drop(0.8)
+    sol.save(tmp_path / "run.npz")
+    same = dvi.Solution.load(tmp_path / "run.npz")
+    for x, y in zip(*map(jax.tree.leaves, (sol.jumps, same.jumps)), strict=True):
+        np.testing.assert_array_equal(x, y)

@@ -33,9 +33,9 @@ def bouncing_ball(restitution: float = 1.0, gravity: float = 1.0, max_jumps: int
     **Example**
 
     ```python
-    sol = dvi.integrate(systems.bouncing_ball(0.8), num_steps=60)
+    sol = dvi.integrate(systems.bouncing_ball(0.8), num_steps=60, method="strang")
     print(int(sol.jumps.count), np.round(sol.jumps.ts[:3], 4))
-    # 4 [1.3659 3.4536 4.9489]
+    # 3 [1.4142 3.677  5.4871]
     ```
     """
     return library_problem(

@@ -51,9 +51,9 @@ def sinai_billiard(radius: float = 0.5, max_jumps: int = 1000) -> Problem:
     **Example**
 
     ```python
-    sol = dvi.integrate(systems.sinai_billiard(), num_steps=200)
+    sol = dvi.integrate(systems.sinai_billiard(), num_steps=20)
     print(int(sol.jumps.count), np.round(sol.jumps.ts[:3], 4), sol.jumps.index[:3])
-    # 123 [0.3333 1.125  1.7735] [1 2 0]
+    # 15 [0.3333 1.125  1.7735] [1 2 0]
     ```
     """
     walls = ((beyond_disc, at_disc), (beyond_x, at_x), (beyond_y, at_y))

@@ -38,9 +38,9 @@ def stadium(half_length: float = 1.0, max_jumps: int = 1000) -> Problem:
     **Example**
 
     ```python
-    sol = dvi.integrate(systems.stadium(), num_steps=200)
+    sol = dvi.integrate(systems.stadium(), num_steps=20)
     print(int(sol.jumps.count), np.round(sol.jumps.ts[:3], 4))
-    # 54 [1.366  3.0981 6.7617]
+    # 4 [1.366  3.0981 6.7617]
     ```
     """
     return billiard(
