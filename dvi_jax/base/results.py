@@ -87,8 +87,8 @@ class RESULTS(eqx.Enumeration):
     not_returned = (
         "The trajectory is at g ≥ 0 of a dvi.Jump that must send it back to g < 0. Likely causes: "
         "(a) its map leaves the state there, or it comes to rest on the surface; (b) the run "
-        "starts there, or on the surface towards g > 0; (c) it was there and back within one step "
-        "before, so that h is too large; (d) the surface may be passed, as for a kick: give "
+        "starts there, or on the surface towards g > 0; (c) it was there within one step before, "
+        "so that h is too large; (d) the surface may be passed, as for a kick: give "
         "returns=False."
     )
     too_many_jumps = (

@@ -151,10 +151,10 @@ def integrate(
     integrator = chosen(integrator, **options)
     instance("save", save, Save, "a dvi.Save(...)", _save_hint(save))
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
-    jumps = tuple(jump) if isinstance(jump, list | tuple) else (jump,)
+    jumps: Any = tuple(jump) if isinstance(jump, list | tuple) else (jump,)
     jumps = getattr(problem, "jumps", ()) if jump is None else jumps
-    for each in jumps:
-        instance("jump", each, Jump, "a dvi.Jump(g, map), or a list of them")
+    for entry in jumps:
+        instance("jump", entry, Jump, "a dvi.Jump(g, map), or a list of them")
     q0, p0 = start_state(q0, p0)
     check = getattr(problem, "check", None)
     if check is not None and not any(map(is_traced, jax.tree.leaves((q0, p0, args)))):

@@ -82,7 +82,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         reductions=[memory(r) for r in reductions],
         remainder=task.arithmetic.start(q0, p0),
         stop=stop,
-        jumps=first_memory(task, q0) if task.jumps else None,
+        jumps=first_memory(task, q0, p0) if task.jumps else None,
         args=jax.tree.map(jnp.asarray, task.args) if task.changes_args else None,
     )
     in_loop = _in_loop(task, q0)
@@ -121,10 +121,9 @@ def take_step(
         q1, p1, remainder = task.arithmetic.leave(q, p, q1, p1)
         info = info_of(task.method, info, q1, p1)
         if task.jumps:
-            whole = q, p, q1, p1, info
-            jumped = with_jumps(task, equations, interval, carry.jumps, whole)
-            part, _ = jumped
-            return (part.q1, part.p1, None), (remainder, part.info, jumped)
+            ends = q, p, q1, p1, info
+            part, records = with_jumps(task, equations, interval, carry.jumps, ends)
+            return (part.q1, part.p1, None), (remainder, part.info, (part, records))
         if conversion is None:
             return (q1, p1, None), (remainder, rounded(info), None)
         x1, y1, last = conversion.last(local, interval, q1, p1)
@@ -137,20 +136,20 @@ def take_step(
     advance = task.constant_unless(was_good, one_step, has_succeeded)
     if task.has_deviations:
         # One linearisation serves all deviation vectors of all reductions.
-        state, push, (remainder, info, jumped) = jax.linearize(advance, *before, has_aux=True)
+        state, push, (remainder, info, jumps) = jax.linearize(advance, *before, has_aux=True)
         if conversion is not None:
             first, of_method = functools.partial(conversion.first, equations, interval), push
             _, enter = jax.linearize(lambda *state: first(*state)[:2], carry.q, carry.p)
             push = lambda *change: of_method(*enter(*change))  # noqa: E731
     else:
-        (state, (remainder, info, jumped)), push = advance(*before), None
+        (state, (remainder, info, jumps)), push = advance(*before), None
     q1, p1, method_state = state
     result = info.result if exists is None else first_failure(exists, info.result)
     # The part of the step without a jump, in which a run may stop.
     last = Ends(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
-    if jumped is not None:
-        last = jumped[0].ends
-        task = task.with_args(carry := carry._replace(args=jumped[0].args))
+    if jumps is not None:
+        last = jumps[0].ends
+        task = task.with_args(carry := carry._replace(args=jumps[0].args))
     result, stop = _stop(task, carry, last, result)
     # After a failure the state is NaN, so that no later step is good: the test of one step is
     # enough, and the loop needs no flag.
@@ -158,12 +157,12 @@ def take_step(
     residual = lax.stop_gradient(info.residual)
     carry_after = carry._replace(method_state=method_state)
     new = _with_failure(carry_after, q1, p1, result, good, residual)
-    ends, continued, has_jumped = last._replace(q1=new.q, p1=new.p), carry, None
-    if jumped is not None:
-        has_jumped = jumped[0].count > 0
-        continued, new = _after_jumps(task, carry, new, interval.t0, *jumped)
+    ends, carry_after_jumps, has_jumped = last._replace(q1=new.q, p1=new.p), carry, None
+    if jumps is not None:
+        has_jumped = jumps[0].number > 0
+        carry_after_jumps, new = _after_jumps(task, carry, new, interval.t0, *jumps)
     rest = remainder, push, interval.h, good, has_jumped
-    memories = _memories(task, continued, ends, *rest)
+    memories = _memories(task, carry_after_jumps, ends, *rest)
     if stop is not None:
         # Reductions cover the steps before the one in which the run stopped.
         is_end = new.result == RESULTS.stopped
@@ -188,28 +187,29 @@ def _after_jumps(
     the reductions that keep steps."""
     memory = after_step(carry.jumps, part)
     if records is None:
-        return carry, new._replace(jumps=memory._replace(count=memory.count + part.count))
+        return carry, new._replace(jumps=memory._replace(number=memory.number + part.number))
     _, reductions = task.observables()
 
     def write(state):
-        def one(state, record):
-            t0, q0, p0, memory, kept = state
+        def add(state, record):
+            t0, q0, p0, memory, memories = state
             ends = Ends(t0, record.t, q0, p0, *record[3:5])
             for i, reduction in enumerate(reductions):
                 if isinstance(reduction, KeptSteps):
                     value = _value(task, record.exists, reduction, ends)
-                    k = _start_number(carry.k, memory.count > carry.jumps.count)
-                    updated = reduction.update(kept[i], k, record.t, value)
-                    kept = [*kept[:i], where(record.exists, updated, kept[i]), *kept[i + 1 :]]
+                    k = _start_number(carry.k, memory.number > carry.jumps.number)
+                    new_memory = reduction.update(memories[i], k, record.t, value)
+                    new_memory = where(record.exists, new_memory, memories[i])
+                    memories = [*memories[:i], new_memory, *memories[i + 1 :]]
             start = where(record.exists, (record.t, *record[5:]), (t0, q0, p0))
-            return (*start, with_row(memory, record), kept), None
+            return (*start, with_row(memory, record), memories), None
 
-        return lax.scan(one, state, records)[0]
+        return lax.scan(add, state, records)[0]
 
     state = t0, carry.q, carry.p, memory, carry.reductions
-    state = lax.cond(lanewise.on_any(part.count > 0), write, lambda state: state, state)
-    continued = carry._replace(reductions=state[4], jumps=state[3])
-    return continued, new._replace(jumps=state[3])
+    state = lax.cond(lanewise.on_any(part.number > 0), write, lambda state: state, state)
+    carry_after_jumps = carry._replace(reductions=state[4], jumps=state[3])
+    return carry_after_jumps, new._replace(jumps=state[3])
 
 
 def _start_number(k: Array, has_jumped: Array) -> Array:

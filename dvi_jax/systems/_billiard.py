@@ -11,7 +11,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2
 
 
-def reflected(p, normal):
+def reflection(p, normal):
     """The momentum after an elastic reflection at a wall with this unit normal."""
     return p - 2 * jnp.sum(p * normal) * normal
 

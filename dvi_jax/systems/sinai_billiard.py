@@ -5,7 +5,7 @@ import numpy as np
 
 from ..base.checks import fraction
 from ..observe import Jump
-from ._billiard import billiard, reflected
+from ._billiard import billiard, reflection
 from ._problem import Parameter, Problem
 
 
@@ -15,7 +15,7 @@ def beyond_disc(t, q, p, args):
 
 
 def at_disc(t, q, p, args):
-    return q, reflected(p, q / args["radius"])
+    return q, reflection(p, q / args["radius"])
 
 
 def beyond_x(t, q, p, args):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..observe import Jump
-from ._billiard import billiard, reflected
+from ._billiard import billiard, reflection
 from ._problem import Parameter, Problem, positive
 
 
@@ -20,7 +20,7 @@ def beyond_wall(t, q, p, args):
 
 
 def at_wall(t, q, p, args):
-    return q, reflected(p, _from_middle(q, args))
+    return q, reflection(p, _from_middle(q, args))
 
 
 def stadium(half_length: float = 1.0, max_jumps: int = 1000) -> Problem:
