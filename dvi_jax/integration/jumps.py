@@ -160,8 +160,8 @@ def jumps_of(memory: JumpMemory, q: State) -> Jumps:
     """The result of a run."""
     rows = jnp.zeros((0, 2 + 4 * q.size), q.dtype) if memory.rows is None else memory.rows
     index = jnp.where(jnp.arange(len(rows)) < memory.number, rows[:, 1], -1).astype(jnp.int32)
-    states = [x.reshape(-1, *q.shape) for x in jnp.split(rows[:, 2:], 4, axis=1)]
-    return Jumps(rows[:, 0], index, *states, memory.number)
+    q0, p0, q1, p1 = (x.reshape(-1, *q.shape) for x in jnp.split(rows[:, 2:], 4, axis=1))
+    return Jumps(rows[:, 0], index, q0, p0, q1, p1, memory.number)
 
 
 def _quiet(like: State) -> float:
@@ -170,7 +170,9 @@ def _quiet(like: State) -> float:
 
 def _values(task: Task, equations: Equations, *point: Any) -> Numbers:
     """g of each jump at a point."""
-    return jnp.stack([event(jump.g, *point, equations.args, "g of Jump") for jump in task.jumps])
+    return jnp.stack(
+        [event(x.g, *point, args=equations.args, name="g of Jump") for x in task.jumps]
+    )
 
 
 def _with_slopes(task: Task, equations: Equations, t, q, p) -> tuple[Numbers, Numbers]:
@@ -336,9 +338,9 @@ def _next_jump(
     # Of jumps at one time one is made first; the others have g = 0 up to rounding.
     is_next = candidates & (numbers != index) & (at_start >= 0) & (at_start <= value)
     end = where(is_end, (t, q, p), (interval.t1, q1, p1))
+    t1, *state = where(is_new_end, (t, *new[:2]), end)
     with_jump = Part(
-        *origin,
-        *where(is_new_end, (t, *new[:2]), end),
+        *(*origin, t1, *state),  # pyright: ignore[reportCallIssue]
         *(jnp.where(is_next, -jnp.finfo(t.dtype).tiny, at_start), at_end, rises, falls),
         jnp.where(numbers == index, fraction + _quiet(q), part.quiet),
         *(new[2], part.info.then(info).then(last), is_end | is_new_end, part.number + is_made),
@@ -362,7 +364,7 @@ def _ends(task: Task, equations: Equations, *point: Any) -> Array:
     """Whether a `Stop` ends the run at a point."""
     if task.stop is None:
         return jnp.asarray(False)
-    return event(task.stop.g, *point, equations.args) >= 0
+    return event(task.stop.g, *point, args=equations.args) >= 0
 
 
 def _with_args(task: Task, equations: Equations, args: Args) -> Equations:

@@ -185,9 +185,9 @@ class ExtendedSpace(eqx.Module):
             stop = Stopped(t_end, q_end, p_end)
         jumps = solution.jumps
         if jumps is not None:
-            *before, _, _ = self.parts(jumps.qs_before, jumps.ps_before)
-            *after, ts, _ = self.parts(jumps.qs_after, jumps.ps_after)
-            jumps = Jumps(ts, jumps.index, *before, *after, jumps.count)
+            q0, p0, ts, _ = self.parts(jumps.qs_before, jumps.ps_before)
+            q1, p1, _, _ = self.parts(jumps.qs_after, jumps.ps_after)
+            jumps = Jumps(ts, jumps.index, q0, p0, q1, p1, jumps.count)
         return Solution(t, q, p, hs, observed, solution.result, solution.stats, stop, jumps)
 
 
