@@ -65,6 +65,8 @@ from .observe import (
     ConstraintForce as ConstraintForce,
     Crossings as Crossings,
     Deviations as Deviations,
+    Jump as Jump,
+    Jumps as Jumps,
     Last as Last,
     LyapunovSpectrum as LyapunovSpectrum,
     MaxDrift as MaxDrift,

@@ -46,6 +46,7 @@ EXAMPLES = {
     "what_is_conserved.py": ("what-is-conserved", "drift_orders.png"),
     "proved.py": ("proved-bounds", ""),
     "noise.py": ("noise", "noise.png"),
+    "events.py": ("events", "events.png"),
     "variational_lattice.py": ("lattices", "variational_damped.png"),
     "sweep_map.py": ("sweeps", "sweep_maps.png"),
     "many_hosts.py": ("clusters", ""),

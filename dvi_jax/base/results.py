@@ -81,8 +81,20 @@ class RESULTS(eqx.Enumeration):
         "dvi.rings.track also reports the element."
     )
     event_not_finite = (
-        "The function g of dvi.Stop or dvi.Section became NaN at a state of the trajectory. Give "
-        "it a value at all states, for example with jnp.where."
+        "The function g of dvi.Stop, dvi.Section or dvi.Jump became NaN at a state of the "
+        "trajectory. Give it a value at all states, for example with jnp.where."
+    )
+    not_returned = (
+        "The trajectory is at g ≥ 0 of a dvi.Jump that must send it back to g < 0. Likely causes: "
+        "(a) its map leaves the state there, or it comes to rest on the surface; (b) the run "
+        "starts there, or on the surface towards g > 0; (c) it was there within one step before, "
+        "so that h is too large; (d) the surface may be passed, as for a kick: give "
+        "returns=False."
+    )
+    too_many_jumps = (
+        "More than 8 jumps of dvi.Jump in one step. Likely causes: (a) they accumulate, as the "
+        "bounces of a ball that comes to rest; (b) the map does not change the direction; (c) h is "
+        "too large. dvi.Stop can end the run before."
     )
 
 
@@ -90,7 +102,7 @@ class RESULTS(eqx.Enumeration):
 STATUS_NAMES = (
     *("successful", "not_converged", "not_finite", "bad_step_size", "no_root", "out_of_range"),
     *("stopped", "not_reached", "step_control_failed", "inconsistent", "redundant"),
-    *("lost", "event_not_finite"),
+    *("lost", "event_not_finite", "not_returned", "too_many_jumps"),
 )
 
 

@@ -1,5 +1,6 @@
-"""Checks before a run: its observables, its noise, and the memory of its results."""
+"""Checks before a run: observables, jumps, noise, and the memory of its results."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -11,12 +12,22 @@ from jaxtyping import Array
 from lanewise.jaxprs.jaxapi import batch_size, is_traced
 from lanewise.primitive import generates
 
-from ..base.checks import function as check_function
+from ..base.checks import array, function as check_function, instance, one_of
 from ..base.machine import results_memory
-from ..base.signature import output_of
+from ..base.signature import array_type, notes_of, output_of
 from ..lattices import Lattice, Run
 from ..methods import Method
-from ..observe import FORMS, Deviations, Range, Reduction, Running, Section, is_observable
+from ..observe import (
+    FORMS,
+    Deviations,
+    Range,
+    Reduction,
+    Running,
+    Section,
+    has_initial_value,
+    is_observable,
+)
+from ..observe._kept import KeptSteps
 from ..observe.solution import Save
 from ..problem.noise import Brownian, BrownianPath, NoisePath
 from .adjoints import Direct
@@ -65,6 +76,66 @@ def check_observe(task: Task, q0: Array, p0: Array) -> tuple[int, int]:
     return at_save, of_reductions
 
 
+def check_jumps(task: Task, request: Run, q0: Array, p0: Array) -> Task:
+    """The task, which knows whether a jump changes args. **Raises** `ValueError` or `TypeError` for
+    jumps that cannot be made, or not together with its other options."""
+    point = task.t0, q0, p0, task.args
+    for jump in task.jumps:
+        output_of("g(t, q, p, args) of Jump", jump.g, *point)
+        with notes_of("map of Jump"):
+            image = eqx.filter_eval_shape(jump.map, *point)
+        hint = "Return (q, p), or (q, p, args)."
+        instance("map(t, q, p, args) of Jump", image, tuple, "a function with a tuple", hint)
+        one_of("the number of values of map of Jump", len(image), (2, 3), hint)
+        for name, value in zip("qp", image, strict=False):
+            value = array_type(f"{name} of map of Jump", value)
+            array(f"{name} of map of Jump", value, q0.shape, integers=True)
+        if len(image) == 3:
+            shapes = [jax.tree.map(jnp.shape, args) for args in (image[2], task.args)]
+            hint = "Return all parameters of the run."
+            one_of("shapes of args of map of Jump", shapes[0], shapes[1:], hint)
+            task = dataclasses.replace(task, changes_args=True)
+    leaves = jax.tree.leaves(request.observe, is_leaf=is_observable)
+    leaves = [leaf.reduction if isinstance(leaf, Running) else leaf for leaf in leaves]
+    functions = [getattr(x, "function", x) if isinstance(x, Reduction) else x for x in leaves]
+    pairs = zip(leaves, functions, strict=True)
+    others = [f for leaf, f in pairs if not isinstance(leaf, Deviations | KeptSteps)]
+    has_points = request.save.ts is not None or any(isinstance(x, KeptSteps) for x in leaves)
+    system = task.equations.system
+    refuse_first(
+        {
+            "jump cannot be used with noise: its path is not known within a step.": (
+                system.noise is not None
+            ),
+            "jump cannot be used for a system with a constraint, because the state after a jump "
+            "need not satisfy it.": system.constraint is not None,
+            f"jump requires arithmetic=dvi.FloatingPoint(), got {task.arithmetic!r:.200}.": (
+                not task.arithmetic.is_plain
+            ),
+            f"jump requires steps that do not depend on those before: dvi.Uniform(), "
+            f"dvi.Given(ts) or dvi.TimeTransformed(g), got {task.lattice!r:.200}.": (
+                task.lattice.has_memory
+            ),
+            "jump cannot be used with an observable of a step, whose ends would lie on both sides "
+            "of a jump: observe functions (q, p) or (t, q, p, args).": (
+                not all(map(has_initial_value, others))
+            ),
+            "a Jump that changes args cannot be used with dvi.Section, dvi.Save(ts=...) or "
+            "deviation vectors: let map return (q, p), or save steps with dvi.Save(every=m).": (
+                task.changes_args and (has_points or task.has_deviations)
+            ),
+        }
+    )
+    return task
+
+
+def refuse_first(conditions: dict[str, bool]) -> None:
+    """**Raises** `ValueError` with the first message that applies."""
+    messages = [message for message, applies in conditions.items() if applies]
+    if messages:
+        raise ValueError(messages[0])
+
+
 def _check_deviations(leaf: Deviations, task: Task, q0: Array) -> None:
     # The derivative of a step is taken at a fixed h; the derivative of h would be missing.
     if task.lattice.has_memory:
@@ -109,9 +180,7 @@ def noise_path(
             run.save.ts is not None or run.stop is not None or has_section
         ),
     }
-    messages = [message for message, applies in conditions.items() if applies]
-    if messages:
-        raise ValueError(messages[0])
+    refuse_first(conditions)
     assert noise is not None
     assert path is not None
     path.check(num_steps)

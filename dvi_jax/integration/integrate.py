@@ -1,6 +1,6 @@
 """`integrate`, the function that computes one trajectory."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Never
 
@@ -21,7 +21,7 @@ from ..engine.guard import nan_where_used
 from ..engine.newton import RootSolver
 from ..lattices import Lattice, Run
 from ..methods import Method
-from ..observe import OfState, Stop, is_observable, of_steps, refuse_slow_time
+from ..observe import Jump, OfState, Stop, is_observable, of_steps, refuse_slow_time
 from ..observe.solution import Save, Solution
 from ..problem.noise import as_path
 from ..problem.system import System, check_system, of_problem
@@ -60,6 +60,7 @@ def integrate(
     layout: Layout | None = None,
     integrator: Integrator | None = None,
     stop: Stop | None = None,
+    jump: Jump | Sequence[Jump] | None = None,
     path: Any = None,
     throw: bool = True,
     progress: bool | Callable[[int, int], None] | None = None,
@@ -97,6 +98,7 @@ def integrate(
       step in constant memory. A `Section` finds the crossings of a surface.
     - `layout`: machine code or arrays, see `Layout`.
     - `stop`: a `Stop`, the condition of an early end (a collision, an escape); or None.
+    - `jump`: a `Jump`, or a list of them: events that change the state (a bounce, a kick); or None.
     - `adjoint`: the computation of reverse-mode gradients: `Reversible`, `Checkpointed`, `Direct`.
     - `root_finder`, or `newton`: the solver of implicit steps: `PicardThenNewton`, `Newton`,
       `SimplifiedNewton`, `Picard`.
@@ -139,13 +141,20 @@ def integrate(
     ```
     """
     refuse_unknown("integrate", integrate, unknown)
-    problem, (system, q0, p0, default_h, args) = system, of_problem(system, q0, p0, h, args)
+    problem, (system, q0, p0, default_h, args) = (
+        system,
+        of_problem(system, q0, p0, h, args, jumps_allowed=True),
+    )
     check_system(system, noise_allowed=True)
     options = {"method": method, "lattice": lattice, "adjoint": adjoint, "newton": newton}
     options |= {"root_finder": root_finder, "arithmetic": arithmetic, "layout": layout}
     integrator = chosen(integrator, **options)
     instance("save", save, Save, "a dvi.Save(...)", _save_hint(save))
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
+    jumps: Any = tuple(jump) if isinstance(jump, list | tuple) else (jump,)
+    jumps = getattr(problem, "jumps", ()) if jump is None else jumps
+    for entry in jumps:
+        instance("jump", entry, Jump, "a dvi.Jump(g, map), or a list of them")
     q0, p0 = start_state(q0, p0)
     check = getattr(problem, "check", None)
     if check is not None and not any(map(is_traced, jax.tree.leaves((q0, p0, args)))):
@@ -154,7 +163,7 @@ def integrate(
         observe = of_steps(observe)
     grid = integrator.lattice
     if system.slow_time:
-        refuse_slow_time(observe, stop, save.clock, getattr(grid, "speed", None))
+        refuse_slow_time(observe, stop, jumps, save.clock, getattr(grid, "speed", None))
     # The h of a problem does not count where the times are given.
     h = default_h if type(grid).takes_h else h
     t0, h, num_steps = steps_of(grid, t0, h, num_steps, t1, duration)
@@ -162,7 +171,7 @@ def integrate(
     h = as_scalar("h", h, q0.dtype, zero_allowed=False)
     epsilon = as_scalar("epsilon", System.strength(system, epsilon), q0.dtype)
     args = jax.tree.map(as_parameter, args)
-    request = Run(system, t0, q0, p0, epsilon, args, observe, save, stop)
+    request = Run(system, t0, q0, p0, epsilon, args, observe, save, stop, jumps)
     trajectory = prepare(request, integrator, h, num_steps, as_path(path))
     solution = solve(trajectory, progress)
     return raise_on_failure(solution, trajectory.task, request) if throw else solution

@@ -22,7 +22,8 @@ from ..methods import InLoop
 from ..methods.constraint import start_status
 from ..methods.step import info_of
 from ..observe import Deviations, Pushed, Reduction, has_initial_value
-from ..observe._kept import StepStart, as_row, event
+from ..observe._kept import KeptSteps, StepStart, as_row, event
+from .jumps import Part, Record, after_step, first_memory, where, with_jumps, with_row
 from .task import Carry, Ends, Outcome, Plan, Rows, Task, adds_start_outside, or_nan
 
 Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
@@ -81,6 +82,8 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         reductions=[memory(r) for r in reductions],
         remainder=task.arithmetic.start(q0, p0),
         stop=stop,
+        jumps=first_memory(task, q0, p0) if task.jumps else None,
+        args=jax.tree.map(jnp.asarray, task.args) if task.changes_args else None,
     )
     in_loop = _in_loop(task, q0)
     if in_loop is None:
@@ -95,6 +98,7 @@ def take_step(
     task: Task, carry: Carry, in_loop: InLoop | None = None
 ) -> tuple[Carry, Interval, Ends]:
     """The next step, its status and its reductions."""
+    task = task.with_args(carry)
     was_good = carry.result == RESULTS.successful
 
     def next_interval(memory, q, p):
@@ -116,36 +120,49 @@ def take_step(
         q1, p1, info = step(local, interval, *state)
         q1, p1, remainder = task.arithmetic.leave(q, p, q1, p1)
         info = info_of(task.method, info, q1, p1)
+        if task.jumps:
+            ends = q, p, q1, p1, info
+            part, records = with_jumps(task, equations, interval, carry.jumps, ends)
+            return (part.q1, part.p1, None), (remainder, part.info, (part, records))
         if conversion is None:
-            return (q1, p1, None), (remainder, rounded(info))
+            return (q1, p1, None), (remainder, rounded(info), None)
         x1, y1, last = conversion.last(local, interval, q1, p1)
-        return (x1, y1, (q1, p1)), (remainder, info.then(last))
+        return (x1, y1, (q1, p1)), (remainder, info.then(last), None)
 
     def has_succeeded(result):
-        _, (_, info) = result
+        _, (_, info, _) = result
         return info.result == RESULTS.successful
 
     advance = task.constant_unless(was_good, one_step, has_succeeded)
     if task.has_deviations:
         # One linearisation serves all deviation vectors of all reductions.
-        state, push, (remainder, info) = jax.linearize(advance, *before, has_aux=True)
+        state, push, (remainder, info, jumps) = jax.linearize(advance, *before, has_aux=True)
         if conversion is not None:
             first, of_method = functools.partial(conversion.first, equations, interval), push
             _, enter = jax.linearize(lambda *state: first(*state)[:2], carry.q, carry.p)
             push = lambda *change: of_method(*enter(*change))  # noqa: E731
     else:
-        (state, (remainder, info)), push = advance(*before), None
+        (state, (remainder, info, jumps)), push = advance(*before), None
     q1, p1, method_state = state
     result = info.result if exists is None else first_failure(exists, info.result)
-    result, stop = _stop(task, carry, interval, q1, p1, result)
+    # The part of the step without a jump, in which a run may stop.
+    last = Ends(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
+    if jumps is not None:
+        last = jumps[0].ends
+        task = task.with_args(carry := carry._replace(args=jumps[0].args))
+    result, stop = _stop(task, carry, last, result)
     # After a failure the state is NaN, so that no later step is good: the test of one step is
     # enough, and the loop needs no flag.
     good = result == RESULTS.successful
     residual = lax.stop_gradient(info.residual)
     carry_after = carry._replace(method_state=method_state)
     new = _with_failure(carry_after, q1, p1, result, good, residual)
-    ends = Ends(interval.t0, interval.t1, carry.q, carry.p, new.q, new.p)
-    memories = _memories(task, carry, ends, remainder, push, interval.h, good)
+    ends, carry_after_jumps, has_jumped = last._replace(q1=new.q, p1=new.p), carry, None
+    if jumps is not None:
+        has_jumped = jumps[0].number > 0
+        carry_after_jumps, new = _after_jumps(task, carry, new, interval.t0, *jumps)
+    rest = remainder, push, interval.h, good, has_jumped
+    memories = _memories(task, carry_after_jumps, ends, *rest)
     if stop is not None:
         # Reductions cover the steps before the one in which the run stopped.
         is_end = new.result == RESULTS.stopped
@@ -160,7 +177,45 @@ def take_step(
         remainder=remainder,
         stop=stop,
     )
-    return new, interval, ends
+    return new, interval, Ends(*interval[:2], carry.q, carry.p, new.q, new.p)
+
+
+def _after_jumps(
+    task: Task, carry: Carry, new: Carry, t0: Scalar, part: Part, records: Record | None
+) -> tuple[Carry, Carry]:
+    """The carries before and after a step, with its jumps, and the parts of the step before them in
+    the reductions that keep steps."""
+    memory = after_step(carry.jumps, part)
+    if records is None:
+        return carry, new._replace(jumps=memory._replace(number=memory.number + part.number))
+    _, reductions = task.observables()
+
+    def write(state):
+        def add(state, record):
+            t0, q0, p0, memory, memories = state
+            ends = Ends(t0, record.t, q0, p0, *record[3:5])
+            for i, reduction in enumerate(reductions):
+                if isinstance(reduction, KeptSteps):
+                    value = _value(task, record.exists, reduction, ends)
+                    k = _start_number(carry.k, memory.number > carry.jumps.number)
+                    new_memory = reduction.update(memories[i], k, record.t, value)
+                    new_memory = where(record.exists, new_memory, memories[i])
+                    memories = [*memories[:i], new_memory, *memories[i + 1 :]]
+            start = where(record.exists, (record.t, *record[5:]), (t0, q0, p0))
+            return (*start, with_row(memory, record), memories), None
+
+        return lax.scan(add, state, records)[0]
+
+    state = t0, carry.q, carry.p, memory, carry.reductions
+    state = lax.cond(lanewise.on_any(part.number > 0), write, lambda state: state, state)
+    carry_after_jumps = carry._replace(reductions=state[4], jumps=state[3])
+    return carry_after_jumps, new._replace(jumps=state[3])
+
+
+def _start_number(k: Array, has_jumped: Array) -> Array:
+    """The number of a step in reductions that keep steps; of a part after a jump that of the first,
+    which may begin on a surface without a crossing."""
+    return jnp.where(has_jumped, 0, k)
 
 
 def _with_failure(
@@ -198,6 +253,7 @@ def _memories(
     push: Callable | None,
     h: Scalar,
     good: Array,
+    has_jumped: Array | None,
 ) -> list[Any]:
     """The memories of the reductions after a step with the derivative `push`, `good` or failed."""
     _, reductions = task.observables()
@@ -206,6 +262,8 @@ def _memories(
 
     def update(reduction: Reduction, memory: Any) -> Any:
         k = number_of(reduction, carry.k)
+        if has_jumped is not None and isinstance(reduction, KeptSteps):
+            k = _start_number(k, has_jumped)
         if isinstance(reduction, Deviations):
             assert push is not None
             vectors = _deviations(push, reduction.vectors(memory), ends, h)
@@ -242,16 +300,14 @@ def _deviations(push: Callable, vectors: Array, ends: Ends, h: Scalar) -> Pushed
     return Pushed(or_nan(good, jax.vmap(push_flat)(vectors)), h)
 
 
-def _stop(
-    task: Task, carry: Carry, interval: Interval, q1: State, p1: State, result: RESULTS
-) -> tuple[RESULTS, Any]:
+def _stop(task: Task, carry: Carry, last: Ends, result: RESULTS) -> tuple[RESULTS, Any]:
     """The status and the stored row, after a step that may meet the condition of a `Stop`."""
     if task.stop is None:
         return result, None
-    value = event(task.stop.g, interval.t1, q1, p1, task.args)
+    value = event(task.stop.g, last.t1, last.q1, last.p1, task.args)
     good = result == RESULTS.successful
     is_end = good & (value >= 0)
-    row = as_row(is_end, StepStart(interval.t0, interval.t1, interval.t1, carry.q, carry.p))
+    row = as_row(is_end, StepStart(last.t0, last.t1, last.t1, last.q0, last.p0))
     result = RESULTS.where(good & jnp.isnan(value), RESULTS.event_not_finite, result)
     return RESULTS.where(is_end, RESULTS.stopped, result), jnp.where(is_end, row, carry.stop)
 
@@ -311,7 +367,7 @@ def run(
             state = or_nan(end.result == RESULTS.successful, (carry.q, carry.p))
             carry = end._replace(method_state=state)
             ends = Ends(*ends[:2], start.q, start.p, end.q, end.p)
-        observed = task.at_save(carry, ends)
+        observed = task.with_args(carry).at_save(carry, ends)
         return carry, Rows(interval.t1, interval.h, carry.q, carry.p, observed, inner)
 
     carry, rows = loop(steps, carry, None, plan.num_blocks)
@@ -324,7 +380,7 @@ def run(
 
 def _in_loop(task: Task, q: State) -> InLoop | None:
     """The step in the loop, and the maps from (q, p) and back; None: that of the method."""
-    if not task.arithmetic.is_plain:
+    if not task.arithmetic.is_plain or task.jumps:
         return None
     point = task.equations, task.first_interval(), q
     # Reductions and a `Stop` read the states of all steps.

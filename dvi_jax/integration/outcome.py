@@ -22,6 +22,7 @@ from ..observe import OfState, Reduction, RequestedTimes, Running, Section, is_o
 from ..observe._kept import StepStart
 from ..observe.solution import Solution
 from .dense import Curve, at_times, crossings, guarded, stop_point
+from .jumps import jumps_of
 from .task import Ends, Outcome, Plan, Task
 
 
@@ -68,9 +69,12 @@ def as_solution(
     observed = observed_values(observe, columns, results)
     end = None
     if task.stop is not None:
+        equations = task.with_args(carry).equations
+        curve = Curve.create(task.method, equations, layout)
         end, of_point = stop_point(curve, task.stop, carry.stop, safe)
         status = with_auxiliary(status, of_point)
-    return Solution(ts, qs, ps, hs, observed, status, stats, end)
+    jumps = jumps_of(carry.jumps, q0) if task.jumps else None
+    return Solution(ts, qs, ps, hs, observed, status, stats, end, jumps)
 
 
 def _values(observables: tuple[list[Any], Any], ends: Ends) -> list[PyTree]:

@@ -25,7 +25,7 @@ from ..observe.solution import Solution
 from ..problem.noise import BrownianPath
 from ..problem.system import System
 from .adjoints import AbstractAdjoint
-from .checks import check_memory, check_observe, noise_path
+from .checks import check_jumps, check_memory, check_observe, noise_path
 from .dense import requested_times
 from .integrator import Integrator
 from .task import Plan, Task, make_plan
@@ -82,6 +82,8 @@ def prepare(
     image, undo = type(lattice).transform(lattice, run)
     type(lattice).check(lattice, method, integrator.arithmetic)
     task, q0, p0 = _task(image, integrator, method, h)
+    if run.jumps:
+        task = check_jumps(task, run, q0, p0)
     if noise is not None:
         task = dataclasses.replace(task, path=noise)
     plan = make_plan(run.save, num_steps)
@@ -146,5 +148,5 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
 
     kind = type(arithmetic)
     equations, q0, p0 = kind.prepare(arithmetic, method, equations, first_interval, run.q0, run.p0)
-    task = Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop)
+    task = Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop, run.jumps)
     return task, q0, p0

@@ -50,9 +50,10 @@ class Reversible(AbstractAdjoint):
     of ``sol.result == dvi.RESULTS.successful``, before it computes.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
-    without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, with deviation
-    vectors (`LyapunovSpectrum`) or `Running` values, and a system or observable that *closes over*
-    a value being differentiated (better: pass it in args), are differentiated as by `Checkpointed`.
+    without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop` or `Jump`, with
+    deviation vectors (`LyapunovSpectrum`) or `Running` values, and a system or observable that
+    *closes over* a value being differentiated (better: pass it in args), are differentiated as by
+    `Checkpointed`.
 
     **Raises** `ValueError` for settings that are not positive, and for `report_defect` where no
     states are reconstructed.
@@ -222,6 +223,8 @@ def _obstacle(task: Task, forward: Callable, *inputs: Any) -> str | None:
         return f"the steps of {type(task.lattice).__name__} depend on those before"
     if task.stop is not None:
         return "a run with a Stop may end before its last step"
+    if task.jumps:
+        return "jumps cannot be followed backwards"
     if task.has_deviations:
         return "deviation vectors cannot be followed backwards"
     if task.has_running_values:

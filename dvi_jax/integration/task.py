@@ -19,7 +19,8 @@ from ..engine.pairs import rounded
 from ..lattices import Lattice
 from ..methods import Method
 from ..methods.step import Equations
-from ..observe import Deviations, Reduction, Running, Stop, is_observable
+from ..observe import Deviations, Jump, Reduction, Running, Stop, is_observable
+from ..observe._kept import KeptSteps
 from ..observe._reductions import no_value
 from ..observe.solution import Save
 from ..problem.noise import NoisePath
@@ -37,6 +38,9 @@ class Task(eqx.Module):
     h: Scalar
     arithmetic: Arithmetic = FloatingPoint()
     stop: Stop | None = None
+    jumps: tuple[Jump, ...] = ()
+    changes_args: bool = eqx.field(static=True, default=False)
+    """Whether a jump changes the parameters, which the loop then carries."""
     reads: Reads = eqx.field(static=True, default=())
     path: NoisePath | None = None
     is_transposed: bool = eqx.field(static=True, default=False)
@@ -45,6 +49,13 @@ class Task(eqx.Module):
     @property
     def args(self) -> Args:
         return self.equations.args
+
+    def with_args(self, carry: "Carry") -> "Task":
+        """The task with the parameters that a jump may have changed."""
+        if not self.changes_args:
+            return self
+        equations = dataclasses.replace(self.equations, args=carry.args)
+        return dataclasses.replace(self, equations=equations)
 
     def interval(self, k: Int[Array, ""]) -> Interval:
         """The interval of step k; of a lattice with a memory, of the first step only."""
@@ -125,6 +136,12 @@ class Task(eqx.Module):
         return any(isinstance(leaf, Running) for leaf in self._leaves())
 
     @property
+    def records_jumps(self) -> bool:
+        """Whether more than the number of jumps is needed."""
+        is_kept = any(isinstance(reduction, KeptSteps) for reduction in self.observables()[1])
+        return is_kept or any(jump.capacity for jump in self.jumps)
+
+    @property
     def has_deviations(self) -> bool:
         """Whether a reduction follows deviation vectors, for which steps are differentiated."""
         return any(isinstance(reduction, Deviations) for reduction in self.observables()[1])
@@ -189,6 +206,8 @@ class Carry(NamedTuple):
     remainder: Any = None  # what the arithmetic stores next to q and p
     stop: Any = None  # with a `Stop`: the last step, as a row
     method_state: Any = None  # of a method with an `InLoop`: the state in its own coordinates
+    jumps: Any = None  # with a `Jump`: a `JumpMemory`
+    args: Args = None  # where a jump changes them
 
 
 class Ends(NamedTuple):

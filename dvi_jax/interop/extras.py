@@ -6,6 +6,7 @@ from typing import Any
 import dvi_jax as dvi
 
 from ..base.checks import instance
+from ..problem.system import without_jumps
 from ..systems import Problem
 
 
@@ -25,6 +26,6 @@ def require(package: str, user: str) -> Any:
 def system_of(problem: Any) -> dvi.System:
     """The `System` itself, or that of a `Problem`. **Raises** `TypeError` for anything else."""
     hint = "For a continuous Hamiltonian H give dvi.System(dvi.discretise(H))."
-    problem = problem.system if isinstance(problem, Problem) else problem
+    problem = without_jumps(problem).system if isinstance(problem, Problem) else problem
     kinds = "a problem of dvi_jax.systems or a dvi.System"
     return instance("system", problem, dvi.System, kinds, hint)

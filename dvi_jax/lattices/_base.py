@@ -17,7 +17,7 @@ from ..base.results import RESULTS
 from ..base.signature import output_of
 from ..base.types import Args, Interval, Scalar, State
 from ..methods.step import Equations
-from ..observe import Stop
+from ..observe import Jump, Stop
 from ..observe.solution import Save, Solution
 from ..problem.system import System
 
@@ -45,6 +45,7 @@ class Run(NamedTuple):
     observe: PyTree
     save: Save
     stop: Stop | None
+    jumps: tuple[Jump, ...] = ()
 
 
 class Lattice(eqx.Module):

@@ -15,6 +15,8 @@ from ..engine.rounding import one_by_one
 from ..observe import (
     Crossings,
     Deviations,
+    Jump,
+    Jumps,
     Reduction,
     Running,
     Section,
@@ -93,7 +95,8 @@ class TimeTransformed(Uniform):
         epsilon = (jnp.ones_like if has_force else jnp.zeros_like)(run.epsilon)
         observe = (observe, _time_gained)  # the second gives ``solution.hs``
         start = jnp.zeros_like(run.t0), q0, p0
-        return Run(system, *start, epsilon, run.args, observe, save, stop), problem.undo
+        jumps = tuple(map(problem.jump, run.jumps))
+        return Run(system, *start, epsilon, run.args, observe, save, stop, jumps), problem.undo
 
 
 class ExtendedSpace(eqx.Module):
@@ -159,6 +162,11 @@ class ExtendedSpace(eqx.Module):
             observable = observable.bind(self.system, self.epsilon)
         return _Observable(observable, self)
 
+    def jump(self, jump: Jump) -> Jump:
+        """A jump of the user, in the extended problem."""
+        g, image = _PointFunction(jump.g, self), _Image(jump.map, self)
+        return Jump(g, image, jump.returns, jump.capacity)
+
     def undo(self, solution: Solution) -> Solution:
         """A solution of the extended problem as one of the original problem."""
 
@@ -175,7 +183,12 @@ class ExtendedSpace(eqx.Module):
         if stop is not None:
             q_end, p_end, t_end, _ = self.parts(stop.q, stop.p)
             stop = Stopped(t_end, q_end, p_end)
-        return Solution(t, q, p, hs, observed, solution.result, solution.stats, stop)
+        jumps = solution.jumps
+        if jumps is not None:
+            q0, p0, ts, _ = self.parts(jumps.qs_before, jumps.ps_before)
+            q1, p1, _, _ = self.parts(jumps.qs_after, jumps.ps_after)
+            jumps = Jumps(ts, jumps.index, q0, p0, q1, p1, jumps.count)
+        return Solution(t, q, p, hs, observed, solution.result, solution.stats, stop, jumps)
 
 
 def _energy(system: System, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> Scalar:
@@ -207,6 +220,15 @@ class _PointFunction(eqx.Module):
     def __call__(self, s, position, momentum, args):
         q, p, t, _ = self.space.parts(position, momentum)
         return self.function(t, q, p, args)
+
+
+class _Image(_PointFunction):
+    """The map of a jump at points of the extended problem; K is 0 after it."""
+
+    def __call__(self, s, position, momentum, args):
+        q, p, *rest = super().__call__(s, position, momentum, args)
+        t = position[-1]
+        return *self.space.start(t, q, p, rest[0] if rest else args), *rest
 
 
 # Functions of the module, which are equal in every run: closures would be compiled again.

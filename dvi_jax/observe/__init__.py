@@ -10,6 +10,7 @@ from ._deviations import (
     Pushed as Pushed,
     TangentMap as TangentMap,
 )
+from ._jump import Jump as Jump, Jumps as Jumps
 from ._kept import Crossings as Crossings, RequestedTimes as RequestedTimes, Section as Section
 from ._reductions import (
     Last as Last,

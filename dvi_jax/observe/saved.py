@@ -12,6 +12,7 @@ from ..base.files import publish_npz, read_npz
 from ..base.precision import refuse_double_without_x64
 from ..base.results import RESULTS, status_code
 from ..base.tables import Table
+from ._jump import Jumps
 from ._stop import Stopped
 
 _FORMAT = 1
@@ -29,6 +30,7 @@ def write(solution: Any, path: str | os.PathLike[str]) -> None:
         "stats": _pack("stats", solution.stats, arrays),
         "observed": _pack("observed", solution.observed, arrays),
         "stop": _pack("stop", solution.stop and tuple(solution.stop), arrays),
+        "jumps": _pack("jumps", solution.jumps and vars(solution.jumps), arrays),
     }
     publish_npz(path, _FORMAT, header, arrays)
 
@@ -47,6 +49,8 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     fields["result"] = eqx.tree_at(lambda r: jax.tree.leaves(r)[0], RESULTS.successful, code)
     fields |= {name: _unpack(header[name], arrays) for name in ("stats", "observed", "stop")}
     fields["stop"] = fields["stop"] and Stopped(*fields["stop"])
+    jumps = _unpack(header.get("jumps"), arrays)  # older files have none
+    fields["jumps"] = jumps and Jumps(**jumps)
     return fields
 
 

@@ -93,6 +93,7 @@ class Solution(eqx.Module):
       shape (S − 1, …), a reduction by one value over all steps.
     - `result`: the status, one of `RESULTS`. After a failure states and observables are NaN.
     - `stop`: the end (t, q, p) of a run with a `Stop`, a `Stopped`, NaN if it did not; else None.
+    - `jumps`: of a run with `jump`: a `Jumps`; else None.
     - `stats`: `num_steps`; `newton_iterations` (total); `max_residual` (largest last correction of
       a solve relative to its scale); `failed_step` (number of the failing step from 0, or −1) and
       `failed_residual` (its last correction, likewise, or 0).
@@ -108,6 +109,7 @@ class Solution(eqx.Module):
     result: RESULTS
     stats: dict[str, Any]
     stop: Any = None
+    jumps: Any = None
 
     @property
     def status(self) -> Any:

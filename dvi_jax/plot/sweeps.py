@@ -45,6 +45,8 @@ _STATUS_COLOURS = {
     "redundant": "#404040",
     "lost": "#8c564b",
     "event_not_finite": "#bcbd22",
+    "not_returned": "#17becf",
+    "too_many_jumps": "#e377c2",
 }
 """One colour for each status in all pictures, so that they can be compared."""
 

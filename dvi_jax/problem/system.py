@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.checks import array, finite, instance, require
+from ..base.checks import array, finite, instance, one_of, require
 from ..base.indices import out_of_bounds
 from ..base.keywords import tracing_note
 from ..base.machine import refuse_fork
@@ -186,22 +186,32 @@ def _read_by(system: System) -> Reads:
 
 
 def of_problem(
-    system: Any, q0: Any, p0: Any, h: Any, args: Any, has_start: bool = False
+    system: Any, q0: Any, p0: Any, h: Any, args: Any, has_start: bool = False, jumps_allowed=False
 ) -> tuple[Any, ...]:
     """System, initial state, step and args of a call that may have a problem of the library, which
     has defaults. **Raises** `TypeError` for a system without an initial state.
 
-    `has_start`: the call has its initial states in another argument.
+    `has_start`: the call has its initial states in another argument. `jumps_allowed`: it makes the
+    jumps of the problem, too.
     """
     # Recognised by its attribute, since the class `Problem` is in a layer above this one.
     if isinstance(getattr(system, "system", None), System):
         problem, system = system, system.system
+        if not jumps_allowed:
+            without_jumps(problem)
         defaults = (("q0", q0), ("p0", p0), ("h", h), ("args", args))
         values = (getattr(problem, name) if value is None else value for name, value in defaults)
         q0, p0, h, args = (None, None, *tuple(values)[2:]) if has_start else values
     elif isinstance(system, System) and not has_start:
         require("a call with a dvi.System", {"q0": q0, "p0": p0})
     return system, q0, p0, h, args
+
+
+def without_jumps(problem: Any) -> Any:
+    """The problem. **Raises** `ValueError` for one with jumps, which a call does not make."""
+    hint = "Only dvi.integrate makes jumps. Give problem.system for the motion between them."
+    one_of("jumps of a problem", tuple(getattr(problem, "jumps", ())), [()], hint)
+    return problem
 
 
 def check_system(system: Any, of_map: str = "", noise_allowed: bool = False) -> None:

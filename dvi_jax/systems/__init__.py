@@ -1,7 +1,8 @@
 """Systems that are ready to run, with parameters, units, initial conditions, known properties.
 
 Each is a function without obligatory arguments that returns a `Problem`. Its entry in `LIBRARY`
-gives the name in run files; `tests/test_library.py` tests every entry.
+gives the name in run files; `tests/test_library.py` tests every entry. Those with jumps are not in
+it, because only `integrate` makes jumps.
 """
 
 from ..base.tables import Table as _Table
@@ -12,6 +13,7 @@ from ._problem import (
     ParameterError as ParameterError,
     Problem as Problem,
 )
+from .bouncing_ball import bouncing_ball as bouncing_ball
 from .dipole_field import dipole_field as dipole_field
 from .double_pendulum import double_pendulum as double_pendulum
 from .duffing import duffing as duffing
@@ -46,9 +48,11 @@ from .relativistic_kepler import relativistic_kepler as relativistic_kepler
 from .restricted_three_body import restricted_three_body as restricted_three_body
 from .rigid_body import rigid_body as rigid_body
 from .rotating_bodies import heavy_top as heavy_top, satellite as satellite
+from .sinai_billiard import sinai_billiard as sinai_billiard
 from .sine_gordon import sine_gordon as sine_gordon
 from .slow_oscillator import slow_oscillator as slow_oscillator
 from .spinning_top import spinning_top as spinning_top
+from .stadium import stadium as stadium
 from .stiff_fput import stiff_fput as stiff_fput
 from .thermal import double_well as double_well, thermal_chain as thermal_chain
 from .toda import toda as toda

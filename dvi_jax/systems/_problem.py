@@ -17,7 +17,7 @@ from ..base.printing import first_lines
 from ..base.tables import Table
 from ..discover.functions.generators import Generator
 from ..discover.symmetries.library import time_translation
-from ..observe import AtEnd, InSlowTime as InSlowTime, OfState
+from ..observe import AtEnd, InSlowTime as InSlowTime, Jump, OfState
 from ..problem.noise import Langevin
 from ..problem.system import System as System
 
@@ -66,6 +66,8 @@ class Problem:
       up to the order of the map.
     - `exact`: function ``(t, q0, p0, args)`` → (q, p), the state at times t [unit of t] of any
       shape from initial conditions at t = 0, shapes t.shape + q0.shape; or None.
+    - `jumps`: the `dvi.Jump` that `integrate` makes where it receives no other; what is known is
+      known of the motion between them.
     - `exact_epsilon`: the ε at which `exact` holds, 0 for the unperturbed system.
 
     **Raises** `ValueError` for a property of an observable or a parameter that does not exist.
@@ -88,6 +90,7 @@ class Problem:
     flow_symmetries: Mapping[str, Generator] = field(default_factory=dict)
     exact: Callable[..., tuple[Any, Any]] | None = None
     exact_epsilon: float = 0.0
+    jumps: tuple[Jump, ...] = ()
 
     def __repr__(self) -> str:
         """What a user gives to `integrate`, and what is known, in at most eight lines."""

@@ -169,6 +169,7 @@ def find_source(file: SystemFile, folder: Path) -> Source:
         with as_input_error("system", rule, *kinds, prefix=prefix, text=text):
             target, defect = target(), f"the result of {name!r}"
     if isinstance(target, systems.Problem):
+        require(not target.jumps, "system", f"{defect} has jumps", "a system without jumps")
         return Source(file, loader, target, target.system)
     if isinstance(target, dvi.System):
         return Source(file, loader, None, target)
