@@ -405,7 +405,7 @@ INVALID = [
 
 @pytest.mark.parametrize(("change", "error", "match"), INVALID)
 def test_invalid_input_of_identify(change, error, match):
-    data = dvi.Observations([0.0, 0.1, 0.2], [[1.0], [0.9], [0.8]], sigma=0.1)
+    data = dvi.Observations([0.0, 0.1, 0.2, 0.3], [[1.0], [0.9], [0.8], [0.7]], sigma=0.1)
     given = {"model": MODEL, "data": data, "library": SMALL, "params": None, **change}
     with pytest.raises(error, match=match):
         dvi.identify(**given)

@@ -1,5 +1,6 @@
 """Identification of an unknown force among many candidate terms."""
 
+import functools
 import itertools
 import warnings
 from collections.abc import Callable, Mapping
@@ -10,21 +11,25 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from lanewise.jaxprs.dependence import depends_on
+
 from ..base.checks import instance, positive
 from ..base.keywords import checked_keywords
 from ..base.printing import printable
 from ..problem.system import System
 from ._fit import fit
+from .checks import enough_values, requires
 from .elimination import Elimination, Removal, places
+from .first_order import field_of
 from .keywords import OptimiserSettings
 from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
-from .model import Group, specification
+from .model import Group, Model, specification
 from .observations import Data, Observations, as_arcs
 from .optimise import FIT_RESULTS, FitError
 from .parameters import Prior, make_space
 from .problem import FitProblem
-from .result import FitResult, doubts, with_error
+from .result import FitResult, doubts, neighbour_remark, with_error
 from .shooting import MultipleShooting, SingleShooting
 
 # Width of a prior: the change of the predictions by the candidate alone, to first order, in
@@ -96,7 +101,7 @@ class Identification:
         if self.fit is not None:
             chi2 = f", reduced chi² {self.fit.reduced_chi2:.4g}" if self.fit.has_errors else ""
             lines.append(f"rms {self.fit.rms:.4g}, {self.fit.num_observed} values{chi2}")
-            lines += doubts(self.fit)
+            lines += filter(None, [*doubts(self.fit), neighbour_remark(self.fit)])
         return "\n".join(lines)
 
 
@@ -153,15 +158,18 @@ def identify(
     as a bound of 2 log C(M, k), Chen & Chen 2008.
     """
     params = {} if params is None else params
+    arcs, is_list = as_arcs(data)
+    if isinstance(params, Mapping):
+        params = {**_starts(model, arcs, is_list), **params}
     bounds, priors = settings.get("bounds"), settings.get("priors")
     loss: Any = settings.get("loss", LeastSquares())
     _check_input(library, params, bounds, priors, loss, penalty)
-    arcs, is_list = as_arcs(data)
     full_model = _with_library(model, library, is_list, params)
     start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
     arcs_with_errors = [_with_errors(arc) for arc in arcs]
     full_problem = full_model, arcs_with_errors, is_list
     unguarded = FitProblem(*full_problem, start, bounds=bounds, loss=loss)
+    enough_values(unguarded.count, unguarded.size, f"{unguarded.size} candidates and parameters")
     common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
     observations = arcs_with_errors if is_list else arcs_with_errors[0]
 
@@ -216,7 +224,7 @@ def identify(
         coefficients=coefficients,
         sigma=sigma,
         system=system,
-        epsilon=spec["epsilon"],
+        epsilon=spec.get("epsilon"),
         path=search.path,
         penalty=search.penalty,
         alternatives=search.alternatives(),
@@ -240,6 +248,18 @@ def _check_input(library: Any, params, bounds, priors, loss, penalty) -> None:
             )
     if penalty is not None:
         positive("penalty", penalty)
+
+
+def _starts(model: Any, arcs: list[Observations], is_list: bool) -> dict[str, Any]:
+    """The first observed states, where a model of first order has no initial state."""
+    is_open = isinstance(model, Model) and model.fixed["q0"] is None
+    if not (is_open and field_of(model.settings["system"])):
+        return {}
+    rows = [np.atleast_1d(arc.in_time_order().values[0]) for arc in arcs]
+    is_usable = all(arc.observe == "positions" for arc in arcs) and len({*map(np.shape, rows)}) == 1
+    if not (is_usable and np.isfinite(rows).all()):
+        return {}  # the model then reports that q0 is missing
+    return {"q0": np.stack(rows) if is_list else rows[0]}
 
 
 class _ModelWithLibrary(eqx.Module):
@@ -274,13 +294,19 @@ def _with_library(model: Any, library: ForceLibrary, is_list: bool, params: Mapp
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         rule = f"None or a dict without {KEY!r}"
         raise TypeError(f"args of the model must be {rule}, got {args!r:.200}.")
+    field = field_of(system)
+    if field is not None:
+        time, state = jnp.zeros(()), jnp.asarray(spec["q0"], float)
+        rates = functools.partial(library.with_coefficients({}), time, time, state, args=args)
+        of_p = depends_on(rates, 0, state)
+        requires(not of_p, "a model of first order", "candidates of x, the first state", "one of p")
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:
         raise ValueError(
             "epsilon cannot be fitted if library is the only force, because only their product is "
             "determined: remove epsilon from params."
         )
-    is_alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
+    is_alone = field is None and not np.any(np.asarray(epsilon)) and "epsilon" not in params
     if is_alone and is_perturbed:
         raise ValueError(
             "the model must have an epsilon other than 0, got epsilon = 0: there is no force then."
