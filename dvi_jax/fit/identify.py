@@ -20,7 +20,7 @@ from ..problem.system import System
 from ._fit import fit
 from .checks import enough_values, requires
 from .elimination import Elimination, Removal, places
-from .first_order import field_of
+from .first_order import by_regression, field_of
 from .keywords import OptimiserSettings
 from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
@@ -165,10 +165,13 @@ def identify(
     loss: Any = settings.get("loss", LeastSquares())
     _check_input(library, params, bounds, priors, loss, penalty)
     full_model = _with_library(model, library, is_list, params)
-    start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
+    zeros = {**params, KEY: dict.fromkeys(library.names, 0.0)}
+    starts = [zeros]
+    if field_of(full_model.base_specification(params, 0)["system"]):
+        starts.insert(0, {**params, KEY: by_regression(full_model, library, arcs, params)})
     arcs_with_errors = [_with_errors(arc) for arc in arcs]
     full_problem = full_model, arcs_with_errors, is_list
-    unguarded = FitProblem(*full_problem, start, bounds=bounds, loss=loss)
+    unguarded = FitProblem(*full_problem, zeros, bounds=bounds, loss=loss)
     enough_values(unguarded.count, unguarded.size, f"{unguarded.size} candidates and parameters")
     common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
     observations = arcs_with_errors if is_list else arcs_with_errors[0]
@@ -185,9 +188,11 @@ def identify(
     full: Any = None
     # The effects over all data bound the terms best. If they are far too large (of a particle at
     # rest, whose force acts for ever), or a fit of the beginning diverges later, the next may not.
-    for span, path in itertools.product((np.inf, _SPAN), (horizons, None)):
+    for start, span, path in itertools.product(starts, (np.inf, _SPAN), (horizons, None)):
         trial = guarded(start, span)
-        result = fit_all(start, trial, shooting=shooting, horizons=path)
+        # From a regression a trajectory may diverge: its size does not say that units differ.
+        checks = {} if start is zeros else {"check_units": False}
+        result = fit_all(start, trial, shooting=shooting, horizons=path, **checks)
         if full is None or full.status == "not_finite" or result.explained > full.explained:
             setting, full = trial, result
         if full.status != "not_finite" and full.explained > _FOLLOWS:
