@@ -117,7 +117,7 @@ def test_noise_gives_no_term_whether_or_not_its_size_is_known(seed, known):
     assert it.coefficients.shape == (0,)
     assert it.fit is None
     assert it.system.force is None
-    assert "no force was detected" in str(it)
+    assert "no term was detected" in str(it)
     assert not known or len(it.path) == 21
 
 

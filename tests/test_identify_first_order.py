@@ -65,7 +65,7 @@ def deviations(found, planted):
     return (found.coefficients - [planted[name] for name in found.terms]) / found.sigma
 
 
-@pytest.mark.parametrize("stages", [1, 2])
+@pytest.mark.parametrize("stages", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_order_of_the_integrator(stages):
     """The equation of q is x' = f, and the auxiliary momenta stay exactly zero."""
     model = dvi.Model.first_order(
@@ -94,6 +94,7 @@ def test_two_arcs_at_irregular_times_with_missing_values():
     assert np.max(found.sigma / np.abs(found.coefficients)) < 0.02
     assert "contradict" not in str(found)
     assert found.fit.params["q0"].shape == (2, 2)
+    assert "q0 fitted, p0 of the model" in str(found.fit)
     rate = jax.grad(found.system.hamiltonian, argnums=3)
     x = jnp.array([0.7, 1.3])
     expected = dict(zip(found.terms, found.coefficients, strict=True))

@@ -83,7 +83,7 @@ def by_regression(model: Any, library: Any, arcs: list[Observations], params: An
             return jnp.stack([known, *(term(t, t, x, zero, args) for term in library.functions)])
 
         ts, xs = arc.ts[good], arc.values[good].reshape(-1, *shape)
-        rates = np.asarray(jax.vmap(slopes)(jnp.asarray(ts), jnp.asarray(xs)))
+        rates = np.asarray(jax.jit(jax.vmap(slopes))(jnp.asarray(ts), jnp.asarray(xs)))
         rates = rates.reshape(*rates.shape[:2], -1)
         areas = np.diff(ts)[:, None, None] * (rates[1:] + rates[:-1]) / 2
         integral = np.concatenate([0 * rates[:1], np.cumsum(areas, axis=0)])

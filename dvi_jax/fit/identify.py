@@ -1,4 +1,4 @@
-"""Identification of an unknown force among many candidate terms."""
+"""Identification of an unknown force, or rate of change, among many candidate terms."""
 
 import functools
 import itertools
@@ -52,7 +52,7 @@ class Identification:
       theirs, with standard errors, shape (k,). The errors are those of the final fit; they do not
       include that the terms were chosen by the same data.
     - `system`: the model's `System` with the identified force and its coefficients. It belongs to
-      the `epsilon` of the model, 1 where that had none.
+      the `epsilon` of the model, 1 where that had none; None for `Model.first_order`.
     - `path`: a `Removal` for each set of candidates, largest first, then those after an exchange.
     - `penalty`: the minimum decrease of the criterion for a term to be kept.
     - `alternatives`: for each term, candidates that could replace it, as pairs (name, increase of
@@ -84,7 +84,7 @@ class Identification:
         count, all_terms = len(self.full.names), self.path[0]
         lines = [f"{len(self.terms)} of {len(all_terms.terms)} candidates"]
         if not self.terms:
-            lines[0] = f"none of {len(all_terms.terms)} candidates: no force was detected"
+            lines[0] = f"none of {len(all_terms.terms)} candidates: no term was detected"
         width = max((len(name) for name in self.terms), default=0)
         for name, c, s in zip(self.terms, self.coefficients, self.sigma, strict=True):
             lines.append(f"  {name:{width}}  {with_error(float(c), float(s))}")
@@ -118,7 +118,7 @@ def identify(
     throw: bool = True,
     **settings: Unpack[OptimiserSettings],
 ) -> Identification:
-    r"""Terms of an unknown force, selected from a library of candidates by observations.
+    r"""Terms of an unknown force or equation x' = f, selected from candidates by observations.
 
         q1 = q0 + h ∂H_D/∂p1,   p1 = p0 − h ∂H_D/∂q0 + h ε (W + Σ c_i f_i)
 
@@ -133,9 +133,11 @@ def identify(
 
     **Arguments**
 
-    - `model`: a `Model`, or a function ``(params)`` or ``(params, arc)`` that returns the arguments
-      of `integrate` as a dict. Its system may have a known force W, to which the library is
-      added; where it has none, epsilon may be left out and is 1. args must be a dict or None.
+    - `model`: a `Model`, or a function ``(params)`` or ``(params, arc)`` that returns the
+      arguments of `integrate` as a dict. Its system may have a known force W, to which the library
+      is added; where it has none, epsilon may be left out and is 1. args must be a dict or None.
+      For an equation x' = f(t, x, args) it is `Model.first_order`; the library is added to f, and
+      where q0 is missing it is fitted from the first observation on.
     - `data`: `Observations`, or a list of them.
     - `library`: a `ForceLibrary` without coefficients.
     - `params`: a dict of what else is fitted, with starting values, as in `fit`: unknown initial

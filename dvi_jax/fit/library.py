@@ -29,7 +29,8 @@ class ForceLibrary(eqx.Module):
         W(t0, t1, q0, p1) = Σ c_i f_i(t0, t1, q0, p1, args)
 
     - `candidates`: ``{name: function}``; each function ``(t0, t1, q0, p1, args)`` returns an
-      array like q0 [unit of the force, over that of its coefficient].
+      array like q0 [unit of the force, over that of its coefficient]. For `Model.first_order`, q0
+      is the state x, p1 must not be used, and the sum is the rate of change x'.
     - `coefficients`: c, shape (M,) in the order of the names; None (the default) reads them from
       ``args["coefficients"]``, where they can be fitted.
 
