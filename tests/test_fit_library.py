@@ -117,7 +117,7 @@ def test_noise_gives_no_term_whether_or_not_its_size_is_known(seed, known):
     assert it.coefficients.shape == (0,)
     assert it.fit is None
     assert it.system.force is None
-    assert "no force was detected" in str(it)
+    assert "no term was detected" in str(it)
     assert not known or len(it.path) == 21
 
 
@@ -405,7 +405,7 @@ INVALID = [
 
 @pytest.mark.parametrize(("change", "error", "match"), INVALID)
 def test_invalid_input_of_identify(change, error, match):
-    data = dvi.Observations([0.0, 0.1, 0.2], [[1.0], [0.9], [0.8]], sigma=0.1)
+    data = dvi.Observations([0.0, 0.1, 0.2, 0.3], [[1.0], [0.9], [0.8], [0.7]], sigma=0.1)
     given = {"model": MODEL, "data": data, "library": SMALL, "params": None, **change}
     with pytest.raises(error, match=match):
         dvi.identify(**given)

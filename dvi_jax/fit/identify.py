@@ -1,5 +1,6 @@
-"""Identification of an unknown force among many candidate terms."""
+"""Identification of an unknown force, or rate of change, among many candidate terms."""
 
+import functools
 import itertools
 import warnings
 from collections.abc import Callable, Mapping
@@ -10,21 +11,25 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from lanewise.jaxprs.dependence import depends_on
+
 from ..base.checks import instance, positive
 from ..base.keywords import checked_keywords
 from ..base.printing import printable
 from ..problem.system import System
 from ._fit import fit
+from .checks import enough_values, requires
 from .elimination import Elimination, Removal, places
+from .first_order import by_regression, field_of
 from .keywords import OptimiserSettings
 from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
-from .model import Group, specification
+from .model import Group, Model, specification
 from .observations import Data, Observations, as_arcs
 from .optimise import FIT_RESULTS, FitError
 from .parameters import Prior, make_space
 from .problem import FitProblem
-from .result import FitResult, doubts, with_error
+from .result import FitResult, doubts, neighbour_remark, with_error
 from .shooting import MultipleShooting, SingleShooting
 
 # Width of a prior: the change of the predictions by the candidate alone, to first order, in
@@ -47,7 +52,7 @@ class Identification:
       theirs, with standard errors, shape (k,). The errors are those of the final fit; they do not
       include that the terms were chosen by the same data.
     - `system`: the model's `System` with the identified force and its coefficients. It belongs to
-      the `epsilon` of the model, 1 where that had none.
+      the `epsilon` of the model, 1 where that had none; None for `Model.first_order`.
     - `path`: a `Removal` for each set of candidates, largest first, then those after an exchange.
     - `penalty`: the minimum decrease of the criterion for a term to be kept.
     - `alternatives`: for each term, candidates that could replace it, as pairs (name, increase of
@@ -79,7 +84,7 @@ class Identification:
         count, all_terms = len(self.full.names), self.path[0]
         lines = [f"{len(self.terms)} of {len(all_terms.terms)} candidates"]
         if not self.terms:
-            lines[0] = f"none of {len(all_terms.terms)} candidates: no force was detected"
+            lines[0] = f"none of {len(all_terms.terms)} candidates: no term was detected"
         width = max((len(name) for name in self.terms), default=0)
         for name, c, s in zip(self.terms, self.coefficients, self.sigma, strict=True):
             lines.append(f"  {name:{width}}  {with_error(float(c), float(s))}")
@@ -96,7 +101,7 @@ class Identification:
         if self.fit is not None:
             chi2 = f", reduced chi² {self.fit.reduced_chi2:.4g}" if self.fit.has_errors else ""
             lines.append(f"rms {self.fit.rms:.4g}, {self.fit.num_observed} values{chi2}")
-            lines += doubts(self.fit)
+            lines += filter(None, [*doubts(self.fit), neighbour_remark(self.fit)])
         return "\n".join(lines)
 
 
@@ -113,7 +118,7 @@ def identify(
     throw: bool = True,
     **settings: Unpack[OptimiserSettings],
 ) -> Identification:
-    r"""Terms of an unknown force, selected from a library of candidates by observations.
+    r"""Terms of an unknown force or equation x' = f, selected from candidates by observations.
 
         q1 = q0 + h ∂H_D/∂p1,   p1 = p0 − h ∂H_D/∂q0 + h ε (W + Σ c_i f_i)
 
@@ -128,9 +133,11 @@ def identify(
 
     **Arguments**
 
-    - `model`: a `Model`, or a function ``(params)`` or ``(params, arc)`` that returns the arguments
-      of `integrate` as a dict. Its system may have a known force W, to which the library is
-      added; where it has none, epsilon may be left out and is 1. args must be a dict or None.
+    - `model`: a `Model`, or a function ``(params)`` or ``(params, arc)`` that returns the
+      arguments of `integrate` as a dict. Its system may have a known force W, to which the library
+      is added; where it has none, epsilon may be left out and is 1. args must be a dict or None.
+      For an equation x' = f(t, x, args) it is `Model.first_order`; the library is added to f, and
+      where q0 is missing it is fitted from the first observation on.
     - `data`: `Observations`, or a list of them.
     - `library`: a `ForceLibrary` without coefficients.
     - `params`: a dict of what else is fitted, with starting values, as in `fit`: unknown initial
@@ -153,15 +160,21 @@ def identify(
     as a bound of 2 log C(M, k), Chen & Chen 2008.
     """
     params = {} if params is None else params
+    arcs, is_list = as_arcs(data)
+    if isinstance(params, Mapping):
+        params = {**_starts(model, arcs, is_list), **params}
     bounds, priors = settings.get("bounds"), settings.get("priors")
     loss: Any = settings.get("loss", LeastSquares())
     _check_input(library, params, bounds, priors, loss, penalty)
-    arcs, is_list = as_arcs(data)
     full_model = _with_library(model, library, is_list, params)
-    start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
+    zeros = {**params, KEY: dict.fromkeys(library.names, 0.0)}
+    starts = [zeros]
+    if field_of(full_model.base_specification(params, 0)["system"]):
+        starts.insert(0, {**params, KEY: by_regression(full_model, library, arcs, params)})
     arcs_with_errors = [_with_errors(arc) for arc in arcs]
     full_problem = full_model, arcs_with_errors, is_list
-    unguarded = FitProblem(*full_problem, start, bounds=bounds, loss=loss)
+    unguarded = FitProblem(*full_problem, zeros, bounds=bounds, loss=loss)
+    enough_values(unguarded.count, unguarded.size, f"{unguarded.size} candidates and parameters")
     common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
     observations = arcs_with_errors if is_list else arcs_with_errors[0]
 
@@ -177,9 +190,11 @@ def identify(
     full: Any = None
     # The effects over all data bound the terms best. If they are far too large (of a particle at
     # rest, whose force acts for ever), or a fit of the beginning diverges later, the next may not.
-    for span, path in itertools.product((np.inf, _SPAN), (horizons, None)):
+    for start, span, path in itertools.product(starts, (np.inf, _SPAN), (horizons, None)):
         trial = guarded(start, span)
-        result = fit_all(start, trial, shooting=shooting, horizons=path)
+        # From a regression a trajectory may diverge: its size does not say that units differ.
+        checks = {} if start is zeros else {"check_units": False}
+        result = fit_all(start, trial, shooting=shooting, horizons=path, **checks)
         if full is None or full.status == "not_finite" or result.explained > full.explained:
             setting, full = trial, result
         if full.status != "not_finite" and full.explained > _FOLLOWS:
@@ -216,7 +231,7 @@ def identify(
         coefficients=coefficients,
         sigma=sigma,
         system=system,
-        epsilon=spec["epsilon"],
+        epsilon=spec.get("epsilon"),
         path=search.path,
         penalty=search.penalty,
         alternatives=search.alternatives(),
@@ -240,6 +255,18 @@ def _check_input(library: Any, params, bounds, priors, loss, penalty) -> None:
             )
     if penalty is not None:
         positive("penalty", penalty)
+
+
+def _starts(model: Any, arcs: list[Observations], is_list: bool) -> dict[str, Any]:
+    """The first observed states, where a model of first order has no initial state."""
+    is_open = isinstance(model, Model) and model.fixed["q0"] is None
+    if not (is_open and field_of(model.settings["system"])):
+        return {}
+    rows = [np.atleast_1d(arc.in_time_order().values[0]) for arc in arcs]
+    is_usable = all(arc.observe == "positions" for arc in arcs) and len({*map(np.shape, rows)}) == 1
+    if not (is_usable and np.isfinite(rows).all()):
+        return {}  # the model then reports that q0 is missing
+    return {"q0": np.stack(rows) if is_list else rows[0]}
 
 
 class _ModelWithLibrary(eqx.Module):
@@ -274,13 +301,19 @@ def _with_library(model: Any, library: ForceLibrary, is_list: bool, params: Mapp
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         rule = f"None or a dict without {KEY!r}"
         raise TypeError(f"args of the model must be {rule}, got {args!r:.200}.")
+    field = field_of(system)
+    if field is not None:
+        time, state = jnp.zeros(()), jnp.asarray(spec["q0"], float)
+        rates = functools.partial(library.with_coefficients({}), time, time, state, args=args)
+        of_p = depends_on(rates, 0, state)
+        requires(not of_p, "a model of first order", "candidates of x, the first state", "one of p")
     is_perturbed = system.force is not None or system.perturbation is not None
     if "epsilon" in params and not is_perturbed:
         raise ValueError(
             "epsilon cannot be fitted if library is the only force, because only their product is "
             "determined: remove epsilon from params."
         )
-    is_alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
+    is_alone = field is None and not np.any(np.asarray(epsilon)) and "epsilon" not in params
     if is_alone and is_perturbed:
         raise ValueError(
             "the model must have an epsilon other than 0, got epsilon = 0: there is no force then."

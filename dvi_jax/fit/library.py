@@ -14,8 +14,10 @@ from jaxtyping import Array
 from ..base.checks import instance, one_of, whole
 from ..base.signature import with_time
 from ..base.types import Args, Scalar, State
+from ..problem.discretise import discretise
 from ..problem.system import System
 from .checks import require_shape
+from .first_order import LibraryField, VectorField, field_of
 
 KEY = "coefficients"  # Key of the coefficients in args and parameters
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -27,7 +29,8 @@ class ForceLibrary(eqx.Module):
         W(t0, t1, q0, p1) = Σ c_i f_i(t0, t1, q0, p1, args)
 
     - `candidates`: ``{name: function}``; each function ``(t0, t1, q0, p1, args)`` returns an
-      array like q0 [unit of the force, over that of its coefficient].
+      array like q0 [unit of the force, over that of its coefficient]. For `Model.first_order`, q0
+      is the state x, p1 must not be used, and the sum is the rate of change x'.
     - `coefficients`: c, shape (M,) in the order of the names; None (the default) reads them from
       ``args["coefficients"]``, where they can be fitted.
 
@@ -66,8 +69,8 @@ class ForceLibrary(eqx.Module):
         r"""All monomials up to a degree, in each of n components.
 
         - `degree`: the largest total degree. `n`: q0 has shape (n,).
-        - `variables`: ``"q"``, ``"p"``, or ``"qp"`` for monomials in both. `constant`: add the
-          constant forces.
+        - `variables`: ``"q"``, ``"p"``, or ``"qp"`` for monomials in both; ``"x"`` for those in the
+          state x of equations of first order. `constant`: add the constant ones.
 
         For one degree of freedom names are ``"q³"``, ``"q² p"``; for more ``"q1 q2 e2"`` is the
         force q1 q2 along the second coordinate. ``monomials(5, 1)`` has 20 candidates,
@@ -76,7 +79,7 @@ class ForceLibrary(eqx.Module):
         **Raises** `ValueError` for invalid arguments.
         """
         degree, n = whole("degree", degree), whole("n", n)
-        one_of("variables", variables, ("q", "p", "qp"))
+        one_of("variables", variables, ("q", "p", "qp", "x"))
         places = [(v, i) for v in variables for i in range(n)]
         forces = [
             _Monomial(tuple(Counter(factors).items()), k, n)
@@ -179,7 +182,7 @@ class _Monomial(eqx.Module):
         require_shape(f"q0 for dvi.ForceLibrary.monomials(degree, {self.n})", q0, (self.n,))
         value = jnp.ones((), q0.dtype)
         for (v, i), power in self.powers:
-            value = value * (q0 if v == "q" else p1)[i] ** power
+            value = value * (p1 if v == "p" else q0)[i] ** power
         return jnp.stack([value if j == self.k else jnp.zeros_like(value) for j in range(self.n)])
 
     @property
@@ -203,6 +206,8 @@ class _ForceSum(eqx.Module):
 
 
 def with_force(system: System, library: ForceLibrary) -> System:
-    """The system with the library's force added to its own."""
+    """The system with the library's force added to its own, or to x' = f for one of first order."""
+    if field := field_of(system):
+        return replace(system, H_D=discretise(VectorField((*field.parts, LibraryField(library)))))
     force = library if system.force is None else _ForceSum(system.force, library)
     return replace(system, force=force)

@@ -21,9 +21,12 @@ from ..discover.functions.basis import check_step_size
 from ..integration.integrate import integrate
 from ..integration.integrator import Integrator
 from ..lattices import Uniform
+from ..methods import GaussLegendre, Method
 from ..observe import refuse_slow_time
 from ..observe.solution import Save
 from ..problem.system import System
+from .first_order import LibraryField, field_of, first_order_system
+from .library import ForceLibrary
 from .observations import Observations
 
 # Steps beyond the ends of shorter arcs above which another program is compiled for them.
@@ -90,6 +93,34 @@ class Model(eqx.Module):
         self.fixed = jax.tree.map(_as_array, fixed)  # Arrays need no other compilation
         self.settings = {"system": system, "h": check_step_size(h), **options}
 
+    @classmethod
+    def first_order(
+        cls,
+        f: Callable[..., Any] | None = None,
+        *,
+        h: float,
+        q0: Any = None,
+        args: PyTree = None,
+        method: Method = GaussLegendre(2),
+        **options: Any,
+    ) -> "Model":
+        r"""The model of a differential equation x' = f(t, x, args), which need not be mechanical.
+
+        x is stored as q: its start is q0, and it is observed as "positions". The Hamiltonian is
+        p·f(t, q, args), whose equation of q is q̇ = f; the auxiliary p is zero and has no effect.
+
+        - `f`: the known part, an array like x; None where all of it is unknown, for `identify`; or
+          a `ForceLibrary`, whose coefficients are those of ``args["coefficients"]``.
+        - `h`, `q0`, `args`, `options`: as for `Model`. `method`: of order 4 by default.
+
+        **Raises** `TypeError` for an f that is not a function of (t, x, args).
+
+        **Source** the Hamiltonian p·f: Pontryagin et al. 1962, *The Mathematical Theory of Optimal
+        Processes*, chapter 1.
+        """
+        field = LibraryField(f) if isinstance(f, ForceLibrary) else f
+        return cls(first_order_system(field), h=h, q0=q0, args=args, method=method, **options)
+
     def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
         """The arguments of `integrate` for an arc (None: there is one, without rows)."""
         surplus = "an array" if hasattr(params, "shape") else f"the type {type(params).__name__}"
@@ -106,6 +137,8 @@ class Model(eqx.Module):
             old = values[name]
             mergeable = isinstance(old, Mapping) and isinstance(value, Mapping)
             values[name] = {**old, **value} if mergeable else value
+        if values["p0"] is None and values["q0"] is not None and field_of(self.settings["system"]):
+            values["p0"] = jnp.zeros_like(jnp.asarray(values["q0"]))
         for name in ("q0", "p0"):
             if values[name] is None:
                 raise TypeError(f"{name} is missing: give it to dvi.Model, or in params.")

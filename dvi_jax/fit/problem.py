@@ -245,7 +245,8 @@ class FitProblem:
         if all(arc.t0 == arc.ts[0] for arc in self.data):
             moment += " (the first observation)"
         roots = {name.split("[")[0] for name in self.space.names}
-        roots &= {"q0", "p0"} if isinstance(self.core.model, Model) else set()
+        model = getattr(self.core.model, "model", self.core.model)  # that inside of `identify`
+        roots &= {"q0", "p0"} if isinstance(model, Model) else set()
         sources = [f"{n} {'fitted' if n in roots else 'of the model'}" for n in ("q0", "p0")]
         return f"initial state at {moment}: {', '.join(sources)}"
 

@@ -31,6 +31,7 @@ _BY_ARC = ("ts", "observed", "predicted", "whitened", "errors")
 _NOTABLE = 0.01  # Part of a standard error from which on round-off is reported
 _NEAR_TURN = 0.05  # Distance from a turn, in turns, that looks like an angle on another branch
 _SIGNIFICANCE = 1e-4  # Probability of a χ² below which the residuals contradict sigma
+_CORRELATED = 4.0  # Correlation of neighbouring residuals, in its standard errors, that is reported
 _LITTLE = 0.1  # A model that explains less of the variance is little better than a constant
 
 
@@ -349,6 +350,18 @@ def _little_explained(fit: FitResult) -> str:
     return (
         f"the model describes the data {comparison} than constants do: this may be a local "
         "minimum, or the data are constants and noise. Start from other parameters."
+    )
+
+
+def neighbour_remark(fit: FitResult) -> str:
+    """The remark on residuals of data without errors that are correlated; empty for others."""
+    lag_one = 0.0 if fit.has_errors else fit.statistics()["lag_one"]
+    if lag_one * np.sqrt(fit.num_observed) < _CORRELATED:
+        return ""
+    return (
+        f"the residuals of neighbouring times are correlated (lag_one {lag_one:.2g}). Likely "
+        "causes: terms are missing, this is a local minimum, h is too large, or the errors of the "
+        "data are not independent. The standard errors do not include this."
     )
 
 

@@ -14,6 +14,7 @@ from ..base.checks import fraction, whole
 from ..integration.integrate import integrate
 from ..observe.solution import Save
 from .checks import require_shape, requires
+from .first_order import field_of
 from .model import make_group, predict, specification, weigh
 from .observations import Observations, nearest_branch
 from .problem import FitProblem
@@ -134,7 +135,8 @@ class Segments:
         indices = range(len(self.problem.arcs))
         states = np.stack([self._guess(i, u) for i in indices])  # (A, S, 2 half)
         flat = states.reshape(-1, 2, self.half)
-        size = np.maximum(np.abs(flat).max(axis=(0, 2)), np.finfo(float).tiny)
+        size = np.abs(flat).max(axis=(0, 2))
+        size = np.where(size > 0, size, 1.0)  # zero is the size of momenta without an effect
         self.orbit = np.repeat(size, self.half)
         return np.concatenate([u, states[:, 1:].ravel()])
 
@@ -265,7 +267,10 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
         return interpolate(flat)
     import optimistix as optx  # here, so that importing the package does not import it
 
-    q, v = interpolate(flat), interpolate(np.gradient(flat, ts, axis=0))
+    q = interpolate(flat)
+    if field_of(spec["system"]):  # the velocity does not depend on p
+        return np.concatenate([q, np.zeros_like(q)], axis=1)
+    v = interpolate(np.gradient(flat, ts, axis=0))
     shape = np.shape(spec["q0"])
     system, args, epsilon = spec["system"], spec.get("args"), spec.get("epsilon", 0.0)
     start = jnp.ravel(jnp.asarray(spec["p0"], float))
