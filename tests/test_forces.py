@@ -12,7 +12,6 @@ from scipy.special import lpmv
 import dvi_jax as dvi
 from dvi_jax import elements, forces, systems
 from dvi_jax.systems.forces._base import bodies_of
-from dvi_jax.systems.planets.relativity import post_newtonian_force
 
 MASSES = np.array([1.0, 1e-3, 3e-4])
 ARGS = {"masses": MASSES, "G": 0.9}
@@ -80,7 +79,7 @@ def test_recoils(name, state):
 
 
 def test_harmonics_are_those_of_the_oblate_planet():
-    """Another formula: J2 in the library, J2 of the Sun in `relativity`."""
+    """Another formula: J2 in the library."""
     oblate = systems.oblate_kepler()
     q = jnp.asarray(oblate.q0) + jnp.array([10.0, 500.0, 900.0])
     gradient = jax.grad(oblate.system.H_D, argnums=2)
@@ -132,12 +131,6 @@ def test_the_energy_of_harmonics(state):
     force = EVERY["harmonics"]
     gradient = jax.grad(force.energy, argnums=2)(0.0, 0.1, *state, ARGS)
     np.testing.assert_allclose(force_on(force, state), -gradient, rtol=1e-12, atol=1e-18)
-
-
-def test_relativity_is_that_of_the_sun(state):
-    args = ARGS | {"c": LIGHT}
-    wanted = post_newtonian_force(0.0, 0.1, *state, args)
-    np.testing.assert_allclose(force_on(EVERY["relativity"], state), wanted, rtol=1e-13)
 
 
 def test_a_third_body_far_away_keeps_its_digits():

@@ -123,7 +123,7 @@ class Force(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented  # sum([f, g])
 
     def __mul__(self, strength: Any) -> "Force":
-        return NotImplemented if isinstance(strength, Force) else Multiple(strength, self)
+        return NotImplemented if isinstance(strength, Force) else Multiple(self, strength)
 
     __rmul__ = __mul__
 
@@ -155,8 +155,8 @@ class Sum(Force):
 class Multiple(Force):
     """A force times a strength, which is a number or a function of args."""
 
+    force: Force
     strength: Any = quantity(finite)
-    force: Force = eqx.field()
 
     def accelerations(self, t, bodies, args):
         factor = self.value("strength", args, bodies.x)
