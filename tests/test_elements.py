@@ -221,7 +221,9 @@ def test_a_parabola():
     assert np.isnan(Delaunay.from_state(q, 1.1 * v, 1.0).L)
     assert np.isnan(Poincare.from_state(q, 1.1 * v, 1.0).Lambda)
     beyond = ModifiedEquinoctial.from_state(q, 1.1 * v, 1.0)._replace(longitude=3.0)
-    assert np.isnan(beyond.state(1.0)[0]).all()
+    with pytest.raises(ValueError, match="beyond the asymptotes"):
+        beyond.state(1.0)
+    assert np.isnan(jax.jit(lambda x: jnp.stack(x.state(1.0)))(beyond)).all()
 
 
 MASSES = np.array([1.0, 1e-3, 3e-4, 5e-5])
@@ -341,19 +343,99 @@ def test_bodies_without_a_mass_that_attract_are_refused():
 
 def test_bad_input():
     q, p = to_bodies(planets(tests=0), MASSES)
+    x, v = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     for wrong, text in [
         (lambda: of_bodies(q, p, MASSES, frame="solar"), "frame must be one of 'jacobi'"),
         (lambda: of_bodies(q, p, MASSES, kind="Kepler"), "kind must be one of 'Keplerian'"),
         (lambda: of_bodies(q, p, np.ones(5)), "number of masses must be"),
         (lambda: of_bodies(q, p[:2], MASSES), "p must be"),
+        (lambda: of_bodies(x, v, MASSES), "number of axes of q"),
+        (lambda: of_bodies(q[:1], p[:1], MASSES[:1]), "the number of bodies must be .* at least 2"),
+        (lambda: of_bodies(q, p, [1.0, -1e-3]), "masses must be between 0"),
+        (lambda: of_bodies(q, p, [0.0, 1e-3]), "mass of body 0 must be positive"),
+        (lambda: of_bodies(q, p, [1.0, np.nan]), "masses must be between 0"),
+        (lambda: of_bodies(q, p, MASSES, -1.0), "G must be a positive"),
+        (lambda: of_bodies(q, p, MASSES, np.ones(3)), "G must be a real scalar"),
         (lambda: Keplerian.from_state(q[0, :1], p[0, :1], 1.0), "last axis of q"),
+        (lambda: Keplerian.from_state(x, v, -1.0), "mu must be positive and finite, got -1.0"),
+        (lambda: Equinoctial.from_state(x, v, np.ones(3)), "mu must be a real scalar"),
         (lambda: planets(0).state(1.0, dim=4), "dim must be one of 2, 3"),
+        (lambda: planets(0).state(1.0, dim=2), "inclination must be 0 or π"),
+        (lambda: planets(0)._replace(e=np.ones(2)).state(1.0), "e of elements.Keplerian must be"),
+        (lambda: planets(0).state(np.ones(2)), "mu must be a real array of shape"),
         (lambda: Elements(frame="solar"), "frame must be one of"),
+        (lambda: Elements(mu=-1.0), "mu of elements.Elements must be a positive"),
     ]:
         with pytest.raises(ValueError, match=text):
             wrong()
-    with pytest.raises(TypeError, match="elements, such as"):
-        to_bodies((1.0, 0.1), MASSES)
+    for wrong, text in [
+        (lambda: to_bodies((1.0, 0.1), MASSES), "elements, such as"),
+        (lambda: to_bodies(planets(0), None), "masses must be an array of real numbers"),
+        (lambda: of_bodies(q, p, MASSES, None), "G must be an array of real numbers"),
+        (lambda: Keplerian.from_state(x + 0j, v, 1.0), "q must be an array of real numbers"),
+        (lambda: Keplerian.from_state(x, "abc", 1.0), "v must be an array of real numbers"),
+        (lambda: Poincare.from_state(x, v, None), "mu must be an array of real numbers"),
+        (lambda: planets(0)._replace(a="1").state(1.0), "a of elements.Keplerian must be an"),
+        (lambda: Elements(frame="jacobi", mu=1.0), "only one of frame and mu"),
+        (lambda: Elements()(0.0, x, v, {"G": 1.0}), r"requires args\['mu'\]"),
+        (lambda: Elements(frame="jacobi")(0.0, q, p, None), r"requires args\['masses'\]"),
+    ]:
+        with pytest.raises(TypeError, match=text):
+            wrong()
     sol = dvi.integrate(systems.kepler(), num_steps=2)
     with pytest.raises(TypeError, match="masses or mu"):
         sol.elements()
+
+
+ORBIT = 1.0, 0.1, 0.2, 0.3, 0.4, 0.5
+
+
+@pytest.mark.parametrize(("elements", "text"), [
+    (Keplerian(*ORBIT)._replace(e=-0.1), "e of elements.Keplerian must be between 0 and inf"),
+    (Keplerian(*ORBIT)._replace(e=1.0), "e = 1 is a ModifiedEquinoctial"),
+    (Keplerian(*ORBIT)._replace(e=1.1), "hyperbolas e > 1 and a < 0"),
+    (Keplerian(*ORBIT)._replace(a=-1.0), "Ellipses have e < 1 and a > 0"),
+    (Equinoctial(*ORBIT)._replace(ex=1.2), "a .1 − e². of elements.Equinoctial"),
+    (Equinoctial(*ORBIT)._replace(a=-1.0), "Ellipses have"),
+    (ModifiedEquinoctial(*ORBIT)._replace(p=-1.0), "p of elements.ModifiedEquinoctial"),
+    (Delaunay(0.0, 0.0, 0.0, 1.0, 1.1, 0.5), "G/L of elements.Delaunay must be between 0 and 1"),
+    (Delaunay(0.0, 0.0, 0.0, 1.0, 0.9, -0.95), "H/G of elements.Delaunay"),
+    (Delaunay(0.0, 0.0, 0.0, -1.0, 0.9, 0.5), "G/L of elements.Delaunay"),
+    (Poincare(0.0, 2.0, 0.0, 1.0, 0.9, 0.5), "G = Λ − .ξ² . η²./2 of elements.Poincare"),
+    (Poincare(0.0, 0.1, 1.5, 1.0, 0.1, 1.5), "4 G − p² − q² of"),
+])  # fmt: skip
+def test_elements_of_no_orbit(elements, text):
+    """Known ones are an error; traced ones, and those of a batch with NaN, are NaN."""
+    with pytest.raises(ValueError, match=text):
+        elements.state(1.0)
+    assert np.isnan(jax.jit(lambda x: jnp.stack(x.state(1.0)))(elements)).any()
+
+
+def test_integers_are_numbers():
+    q, v = np.array([1, 0, 0]), np.array([0, 1, 0])
+    for kind in (Delaunay, Poincare):  # which use all others
+        whole, real = kind.from_state(q, v, 1), kind.from_state(1.0 * q, 1.0 * v, 1.0)
+        np.testing.assert_array_equal(whole, real)
+    np.testing.assert_array_equal(of_bodies([q, 2 * q], [v, v], [1, 1]).e, of_bodies(
+        1.0 * np.array([q, 2 * q]), 1.0 * np.array([v, v]), [1.0, 1.0]).e)  # fmt: skip
+    single = Keplerian.from_state(q.astype("f4"), v.astype("f4"), 1.0)
+    assert {x.dtype.name for x in single} == {"float32"}
+
+
+def test_a_state_that_failed_does_not_affect_others():
+    """NaN gives NaN, next to good orbits."""
+    e = np.array([0.1, np.nan, 0.3])
+    q, v = Keplerian(1.0, e, 0.1, 0.2, 0.3, 0.4).state(1.0)
+    assert np.isnan(q).any(axis=1).tolist() == np.isnan(v).any(axis=1).tolist() == [0, 1, 0]
+    again = Keplerian.from_state(q, v, 1.0)
+    np.testing.assert_allclose(again.e[::2], e[::2], rtol=1e-14)
+
+
+def test_a_mass_of_zero_is_a_test_particle():
+    """Its row of p is the velocity, as without an entry in the masses."""
+    orbits = planets(tests=1)
+    states = [to_bodies(orbits, masses) for masses in (MASSES, [*MASSES, 0.0])]
+    np.testing.assert_array_equal(*states)
+    elements = [of_bodies(*states[0], masses) for masses in (MASSES, [*MASSES, 0.0])]
+    np.testing.assert_array_equal(*elements)
+    np.testing.assert_allclose(elements[0], orbits, atol=1e-13)

@@ -1,6 +1,7 @@
 """Perturbing forces against other formulas, REBOUNDx and rates of the literature."""
 
 import ctypes
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,19 +11,23 @@ from scipy.special import lpmv
 
 import dvi_jax as dvi
 from dvi_jax import elements, forces, systems
-from dvi_jax.systems.planets.relativity import post_newtonian_force
+from dvi_jax.systems.forces._base import bodies_of
 
 MASSES = np.array([1.0, 1e-3, 3e-4])
 ARGS = {"masses": MASSES, "G": 0.9}
 MU, LIGHT = 1.7, 30.0
 
 
+def state_of(masses, second=2.0):
+    orbits = elements.Keplerian(
+        [1.0, second], [0.1, 0.2], [0.3, 0.2], [1.0, 2.0], [0.5, 0.1], [0.7, 2.7]
+    )
+    return elements.to_bodies(orbits, masses, ARGS["G"])
+
+
 @pytest.fixture(scope="module")
 def state():
-    orbits = elements.Keplerian(
-        [1.0, 2.0], [0.1, 0.2], [0.3, 0.2], [1.0, 2.0], [0.5, 0.1], [0.7, 2.7]
-    )
-    return elements.to_bodies(orbits, MASSES, ARGS["G"])
+    return state_of(MASSES)
 
 
 def force_on(force, state, args=ARGS):
@@ -39,6 +44,7 @@ R, V = np.array([0.8, -0.5, 0.6]), np.array([0.3, 0.9, -0.2])
 EVERY = {
     "harmonics": forces.Harmonics(0.3, {2: 0.1, 4: -0.03}),
     "relativity": forces.Relativity(LIGHT),
+    "all bodies": forces.PostNewtonian(LIGHT),
     "rotation": forces.LenseThirring(np.array([0.1, 0.2, 0.3]), LIGHT),
     "tides": forces.Tides(30.0, 0.2, 0.4, (0.0, 0.0, 0.7)),
     "radiation": forces.Radiation(np.array([0.1, 0.3]), LIGHT),
@@ -54,7 +60,7 @@ EVERY = {
 @pytest.mark.parametrize("name", EVERY)
 def test_a_satellite_is_a_body_without_mass(name, state):
     """The same acceleration as in a system of bodies, with the parameters of the first of them."""
-    q, p = jnp.stack([jnp.zeros(3), R, R]), jnp.stack([jnp.zeros(3), V, V])
+    q, p = jnp.stack([jnp.zeros(3), R, 2 * R]), jnp.stack([jnp.zeros(3), V, V])
     of_bodies = EVERY[name](0.5, 0.5, q, p, {"masses": np.array([MU])})
     alone = EVERY[name]
     for kind in (forces.Radiation, forces.Damping):
@@ -73,7 +79,7 @@ def test_recoils(name, state):
 
 
 def test_harmonics_are_those_of_the_oblate_planet():
-    """Another formula: J2 in the library, J2 of the Sun in `relativity`."""
+    """Another formula: J2 in the library."""
     oblate = systems.oblate_kepler()
     q = jnp.asarray(oblate.q0) + jnp.array([10.0, 500.0, 900.0])
     gradient = jax.grad(oblate.system.H_D, argnums=2)
@@ -125,12 +131,6 @@ def test_the_energy_of_harmonics(state):
     force = EVERY["harmonics"]
     gradient = jax.grad(force.energy, argnums=2)(0.0, 0.1, *state, ARGS)
     np.testing.assert_allclose(force_on(force, state), -gradient, rtol=1e-12, atol=1e-18)
-
-
-def test_relativity_is_that_of_the_sun(state):
-    args = ARGS | {"c": LIGHT}
-    wanted = post_newtonian_force(0.0, 0.1, *state, args)
-    np.testing.assert_allclose(force_on(EVERY["relativity"], state), wanted, rtol=1e-13)
 
 
 def test_a_third_body_far_away_keeps_its_digits():
@@ -229,6 +229,11 @@ def test_sums_factors_and_problems(state):
         EVERY["tides"].add_to(problem.system)
     with pytest.raises(TypeError):
         EVERY["tides"] + 1.0
+    wanted = force_on(EVERY["harmonics"], state) + 2 * force_on(EVERY["tides"], state)
+    for two in (2.0, np.float64(2.0), np.array(2.0), jnp.array(2.0)):
+        for product in (two * EVERY["tides"], EVERY["tides"] * two):
+            same = sum([EVERY["harmonics"], product])
+            np.testing.assert_allclose(force_on(same, state), wanted, rtol=1e-14)
 
 
 def test_only_some_bodies(state):
@@ -239,24 +244,102 @@ def test_only_some_bodies(state):
     for i in (0, 3):
         with pytest.raises(ValueError, match="each of on_bodies must be one of 1, 2"):
             force_on(forces.Radiation(0.1, LIGHT, on_bodies=(i,)), state)
+    np.testing.assert_array_equal(
+        W, force_on(forces.Radiation(0.1, LIGHT, on_bodies=[2, 2]), state)
+    )
+    assert np.all(force_on(forces.Radiation(0.1, LIGHT, on_bodies=()), state) == 0)
     plane = tuple(x[:, :2] for x in state)
     for name, text in {
-        "harmonics": "pole of Harm",
-        "rotation": "momentum",
-        "disk": "pole of Gal",
+        "harmonics": "pole of forces.Harm",
+        "rotation": "positions with forces.LenseThirring",
+        "disk": "pole of forces.Gal",
     }.items():
         with pytest.raises(ValueError, match=text):
             force_on(EVERY[name], plane)
-    for name in ("tides", "radiation", "damping", "outgassing"):
+    for name in ("tides", "radiation", "damping", "outgassing", "all bodies"):
         assert force_on(EVERY[name], plane).shape == (3, 2)
-    with pytest.raises(ValueError, match="mu"):
-        EVERY["relativity"](0.0, 0.1, jnp.asarray(R), jnp.asarray(V), {})
-    with pytest.raises(ValueError, match="degree"):
-        forces.Harmonics(1.0, {1: 0.1})
-    with pytest.raises(ValueError, match="order"):
-        forces.Harmonics(1.0, {}, {(2, 3): (0.1, 0.1)})
-    with pytest.raises(TypeError, match="path"):
-        forces.ThirdBody(np.ones(3), 1.0)
+    # A pole in the plane: as the same motion in space.
+    force = forces.Harmonics(0.3, {2: 0.1, 3: 0.04}, pole=(3.0, -4.0))
+    flat = tuple(x.at[:, 2].set(0.0) for x in state)
+    in_space = force_on(forces.Harmonics(0.3, {2: 0.1, 3: 0.04}, pole=(0.6, -0.8, 0.0)), flat)
+    np.testing.assert_allclose(force_on(force, plane), in_space[:, :2], rtol=1e-13)
+    assert np.all(in_space[:, 2] == 0)
+
+
+def of_args(value):
+    return lambda args: value
+
+
+@pytest.mark.parametrize(("kind", "text", "wrong"), [
+    (ValueError, "c of forces.Relativity must be a positive and finite number, got 'c'",
+     lambda: forces.Relativity("c")),
+    (ValueError, "c of forces.PostNewtonian must be a positive", lambda: forces.PostNewtonian(0.0)),
+    (ValueError, "c of forces.LenseThirring must be", lambda: forces.LenseThirring(V, np.inf)),
+    (ValueError, "momentum of forces.LenseThirring must be a finite",
+     lambda: forces.LenseThirring((0.0, np.nan, 1.0), 1.0)),
+    (ValueError, "beta of forces.Radiation must be zero or a positive finite number, got None",
+     lambda: forces.Radiation(None, LIGHT)),
+    (ValueError, "beta of forces.Radiation must be zero", lambda: forces.Radiation([0.1, -1], 1)),
+    (TypeError, "function of .args., got <class 'float'>", lambda: forces.Radiation(float, LIGHT)),
+    (ValueError, "k2 of forces.Tides", lambda: forces.Tides(-1.0, 0.1, 0.3)),
+    (ValueError, "lag of forces.Tides", lambda: forces.Tides(1.0, True, 0.3)),
+    (ValueError, "radius of forces.Tides", lambda: forces.Tides(1.0, 0.1, 0.0)),
+    (ValueError, "spin of forces.Tides", lambda: forces.Tides(1.0, 0.1, 0.3, None)),
+    (ValueError, "tau_e of forces.Damping must not be zero", lambda: forces.Damping(tau_e=0.0)),
+    (ValueError, "tau_a of forces.Damping", lambda: forces.Damping([np.inf, np.nan])),
+    (ValueError, "timescale of forces.MassLoss", lambda: forces.MassLoss(0)),
+    (ValueError, "r0 of forces.Outgassing", lambda: forces.Outgassing(r0=-1.0)),
+    (ValueError, "A1 of forces.Outgassing", lambda: forces.Outgassing(1j)),
+    (ValueError, "ballistic of forces.Drag", lambda: forces.Drag(lambda r, args: 1.0, -2.0)),
+    (TypeError, "density of Drag must take", lambda: forces.Drag(lambda r: 1.0, 2.0)),
+    (TypeError, "path", lambda: forces.ThirdBody(np.ones(3), 1.0)),
+    (TypeError, "path of ThirdBody must take", lambda: forces.ThirdBody(lambda t: R, 1.0)),
+    (ValueError, "mu of forces.ThirdBody", lambda: forces.ThirdBody(lambda t, args: R, -1.0)),
+    (ValueError, "strength of forces.GalacticTide", lambda: forces.GalacticTide(-1.0)),
+    (ValueError, "length of pole", lambda: forces.GalacticTide(1.0, (0.0, 0.0, 0.0))),
+    (ValueError, "length of pole", lambda: forces.Harmonics(1.0, {2: 0.1}, pole=(0, 0, 0))),
+    (TypeError, "pole of forces.Harmonics", lambda: forces.Harmonics(1.0, {2: 0.1}, pole=None)),
+    (ValueError, "radius of forces.Harmonics", lambda: forces.Harmonics(-1.0, {2: 0.1})),
+    (TypeError, "zonal must be a dict", lambda: forces.Harmonics(1.0, [0.1])),
+    (TypeError, "tesseral must be a dict", lambda: forces.Harmonics(1.0, {}, None)),
+    (ValueError, "each key .n, m. of tesseral", lambda: forces.Harmonics(1.0, {}, {2: (0.1, 0.1)})),
+    (ValueError, "harmonic 2 must be a finite", lambda: forces.Harmonics(1.0, {2: np.nan})),
+    (ValueError, "degree", lambda: forces.Harmonics(1.0, {1: 0.1})),
+    (ValueError, "order", lambda: forces.Harmonics(1.0, {}, {(2, 3): (0.1, 0.1)})),
+    (ValueError, "each of on_bodies must be", lambda: forces.Relativity(1.0, on_bodies=(1.0,))),
+    (ValueError, "strength of forces.Multiple", lambda: "a" * EVERY["tides"]),
+    (TypeError, "unsupported", lambda: EVERY["tides"] * EVERY["disk"]),
+    # In a run: shapes, and values of functions of args.
+    (ValueError, "mu", lambda: EVERY["relativity"](0.0, 0.1, R, V, {})),
+    (ValueError, "last axis of q", lambda: at(R[:1], V[:1], EVERY["tides"])),
+    (ValueError, r"c of forces.Relativity must be a real scalar", lambda: at(
+        R, V, forces.Relativity([1.0, 2.0]))),
+    (ValueError, r"beta of forces.Radiation .* \(1,\).* got shape \(3,\)", lambda: at(
+        R, V, forces.Radiation(of_args(np.ones(3)), LIGHT))),
+    (ValueError, "harmonic 2 must be a real scalar", lambda: at(
+        R, V, forces.Harmonics(1.0, {2: np.ones(2)}))),
+    (ValueError, r"harmonic \(2, 2\) must be a real array of shape \(2,\)", lambda: at(
+        R, V, forces.Harmonics(1.0, {}, {(2, 2): 0.1}))),
+    (ValueError, "positions with tesseral", lambda: at(
+        R[:2], V[:2], forces.Harmonics(1.0, {}, {(2, 2): (0.1, 0.0)}, pole=(0.0, 1.0)))),
+    (ValueError, "density of Drag must return", lambda: at(
+        R, V, forces.Drag(lambda r, args: r, 2.0))),
+    (ValueError, "path of ThirdBody must return", lambda: at(
+        R, V, forces.ThirdBody(lambda t, args: 1.0, 2.0))),
+    (ValueError, "positions must be", lambda: EVERY["all bodies"].energy(0.0, 1.0, R, V, {
+        "masses": MASSES, "mu": MU})),
+])  # fmt: skip
+def test_bad_input(kind, text, wrong):
+    with pytest.raises(kind, match=text):
+        wrong()
+
+
+def test_parameters_that_are_traced_are_not_checked():
+    """Their values are NaN or infinite, in one element of a batch only."""
+    values = jnp.array([LIGHT, 0.0, 2 * LIGHT])
+    batch = jax.vmap(lambda c: forces.Relativity(c)(0.0, 1.0, R, V, {"mu": MU}))(values)
+    assert np.isfinite(batch).all(axis=1).tolist() == [1, 0, 1]
+    np.testing.assert_allclose(batch[0], 4 * batch[2], rtol=1e-14)
 
 
 @pytest.mark.slow
@@ -306,9 +389,26 @@ def reboundx_case(name):
                     planet["tau_a"], planet["tau_e"], planet["tau_inc"] = taus
             case "gr":
                 force.params["c"] = 1e5
+            case "gr_full":
+                force.params["c"] = LIGHT
         return force
 
     return set_up
+
+
+def in_rebound(state, masses=MASSES):
+    """A simulation of REBOUND, and a function that computes its accelerations."""
+    rebound = pytest.importorskip("rebound")
+    sim = rebound.Simulation()
+    sim.G = ARGS["G"]
+    for m, x, p in zip(masses, *map(np.asarray, state), strict=True):
+        sim.add(m=m, **dict(zip(("x", "y", "z", "vx", "vy", "vz"), [*x, *(p / m)], strict=True)))
+
+    def accelerations():
+        rebound.clibrebound.reb_simulation_update_acceleration(ctypes.byref(sim))
+        return np.array([[body.ax, body.ay, body.az] for body in sim.particles])
+
+    return sim, accelerations
 
 
 @pytest.mark.parametrize(("name", "force", "limit"), [
@@ -320,17 +420,8 @@ def reboundx_case(name):
     ("gr", forces.Relativity(1e5), 3e-3),
 ])  # fmt: skip
 def test_accelerations_are_those_of_reboundx(name, force, limit, state):
-    rebound = pytest.importorskip("rebound")
     reboundx = pytest.importorskip("reboundx")
-    sim = rebound.Simulation()
-    sim.G = ARGS["G"]
-    for m, x, p in zip(MASSES, *map(np.asarray, state), strict=True):
-        sim.add(m=m, **dict(zip(("x", "y", "z", "vx", "vy", "vz"), [*x, *(p / m)], strict=True)))
-
-    def accelerations():
-        rebound.clibrebound.reb_simulation_update_acceleration(ctypes.byref(sim))
-        return np.array([[body.ax, body.ay, body.az] for body in sim.particles])
-
+    sim, accelerations = in_rebound(state)
     before = accelerations()
     extras = reboundx.Extras(sim)
     extras.add_force(reboundx_case(name)(sim, extras))
@@ -338,3 +429,88 @@ def test_accelerations_are_those_of_reboundx(name, force, limit, state):
     ours = force_on(force, state) / MASSES[:, None]
     assert np.abs(theirs - ours).max() < limit * np.abs(theirs).max() + 4e-16 * np.abs(before).max()
     assert np.abs(theirs).max() > 0
+
+
+HEAVY = np.array([1.0, 0.3, 0.1])
+
+
+def newton(q):
+    energy = partial(systems.n_body().system.H_D, 0.0, 0.0)
+    return -jax.grad(energy)(q, 0 * q, {**ARGS, "masses": HEAVY}) / HEAVY[:, None]
+
+
+def test_relativity_of_all_bodies_is_that_of_reboundx():
+    """`gr_full` has its own accelerations on the right-hand side, where ours are Newton's. It takes
+    velocities relative to the centre of mass, which is at rest here."""
+    reboundx = pytest.importorskip("reboundx")
+    q, p = state_of(HEAVY, 2.6)
+    sim, accelerations = in_rebound((q, p), HEAVY)
+    before = accelerations()
+    extras = reboundx.Extras(sim)
+    extras.add_force(reboundx_case("gr_full")(sim, extras))
+    theirs = accelerations() - before
+    force, args = EVERY["all bodies"], {**ARGS, "masses": HEAVY}
+    total = newton(q)
+    for _ in range(12):
+        terms = force.corrections(bodies_of(q, p, args), total) / LIGHT**2
+        total = newton(q) + terms
+    size = np.abs(before).max()
+    assert np.abs(theirs - terms).max() < 1e-15 * size
+    # To first order: the difference is of the next order in 1/c².
+    ours = force_on(force, (q, p), args) / HEAVY[:, None]
+    assert 1e-4 < np.abs(theirs - ours).max() / np.abs(theirs).max() < 5 / LIGHT**2
+
+
+@pytest.mark.parametrize("light", [LIGHT, 2 * LIGHT])
+def test_the_two_forms_of_relativity_of_all_bodies(state, light):
+    """The acceleration of Hamilton's equations is that of the force, up to O(1/c⁴)."""
+    force, args = forces.PostNewtonian(light), {**ARGS, "masses": HEAVY}
+    q, v = state[0], state[1] / MASSES[:, None]
+    p = force.momenta(q, v, args)
+
+    def rates(q, p):
+        def H(q, p):
+            step = 0.0, 0.0, q, p, args
+            return systems.n_body().system.H_D(*step) + force.energy(*step)
+
+        dq, dp = jax.grad(H, argnums=(0, 1))(q, p)
+        return dp, -dq
+
+    (rate, pull), (a, _) = jax.jvp(rates, (q, p), rates(q, p))
+    by_force = newton(q) + force_on(force, (q, HEAVY[:, None] * v), args) / HEAVY[:, None]
+    np.testing.assert_allclose(rate, force.velocities(q, p, args), atol=1e-15)
+    np.testing.assert_allclose(pull.sum(axis=0), 0, atol=1e-16)  # total momentum
+    # The same multiple of 1/c⁴ for both c: 15.1 of the velocities.
+    assert np.abs(rate - v).max() * light**4 == pytest.approx(15.06, abs=0.02)
+    assert 0.1 < np.abs(a - by_force).max() * light**4 < 10
+    one = forces.Relativity(light)
+    relative = force_on(one, (q, HEAVY[:, None] * v), args) / HEAVY[:, None]
+    assert np.abs(a - newton(q) - relative).max() * light**2 > 0.1  # negative control
+
+
+@pytest.mark.slow
+def test_conserved_quantities_of_the_relativity_of_all_bodies():
+    """Energy and momentum of first order in a run with the force: constant up to O(1/c⁴)."""
+    q, p = state_of(HEAVY, 2.6)
+    problem = systems.n_body(HEAVY, q, p, G=ARGS["G"])
+    force = forces.PostNewtonian(lambda args: args["c"])
+    run = {"h": 0.02, "num_steps": 300, "method": dvi.GaussLegendre(3)}
+
+    @jax.jit
+    @jax.vmap
+    def values(light):
+        args = problem.args | {"c": light}
+        sol = dvi.integrate(force.add_to(problem), args=args, **run)
+
+        def quantities(q, p):
+            canonical = force.momenta(q, p / HEAVY[:, None], args)
+            step = 0.0, 0.0, q, canonical, args
+            H = problem.system.H_D(*step)
+            return jnp.array([H, H + force.energy(*step), *p.sum(axis=0), *canonical.sum(axis=0)])
+
+        return jax.vmap(quantities)(sol.qs, sol.ps)
+
+    computed = np.asarray(values(jnp.array([20.0, 40.0])))
+    change = np.abs(computed - computed[:, :1]).max(axis=1)
+    slow, fast = np.stack([change[:, 0], change[:, 1], *change[:, 2:].reshape(2, 2, 3).max(2).T]).T
+    np.testing.assert_allclose(np.log2(slow / fast), [2, 4, 2, 4], atol=0.3)

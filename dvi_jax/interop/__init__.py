@@ -1,4 +1,4 @@
-"""Interoperability with diffrax, REBOUND, SciPy, astropy and ArviZ.
+"""Interoperability with diffrax, REBOUND, SciPy, astropy, ArviZ and jplephem.
 
 ``from dvi_jax import interop``. A function imports the other package when it is called; without it
 there is an `ImportError` with the line that installs it.
@@ -7,6 +7,7 @@ there is an `ImportError` with the line that installs it.
 from .arviz_side import to_inference_data as to_inference_data
 from .diffrax_side import diffrax_solver as diffrax_solver, diffrax_term as diffrax_term
 from .fields import vector_field as vector_field
+from .jplephem_side import EphemerisPath as EphemerisPath, ephemeris_path as ephemeris_path
 from .rebound_side import (
     ReboundProblem as ReboundProblem,
     from_rebound as from_rebound,

@@ -10,7 +10,7 @@ from ..problem.system import without_jumps
 from ..systems import Problem
 
 
-def require(package: str, user: str) -> Any:
+def require(package: str, user: str, extra: str = "interop") -> Any:
     """The module `package`. **Raises** `ImportError` with the line that installs it."""
     try:
         return importlib.import_module(package)
@@ -18,7 +18,7 @@ def require(package: str, user: str) -> Any:
         if error.name not in (None, package, package.partition(".")[0]):
             raise  # the package is installed, and something that it needs is not
         raise ImportError(
-            f'{user} requires {package.partition(".")[0]}: pip install "dvi-jax[interop]".',
+            f'{user} requires {package.partition(".")[0]}: pip install "dvi-jax[{extra}]".',
             name=package,
         ) from None
 

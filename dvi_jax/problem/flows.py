@@ -23,7 +23,7 @@ def value_of(parameter: Parameter, args: Args, like: Array) -> Array:
     """The value of a parameter, in the precision of another array."""
     if callable(parameter):
         with notes_of("the function of args that gives a parameter"):
-            parameter = parameter(args)
+            return jnp.asarray(parameter(args), like.dtype)
     return jnp.asarray(parameter, like.dtype)
 
 

@@ -86,6 +86,8 @@ class Heliocentric(NamedTuple):
     def central_mass(self) -> Array:
         return self.masses[0] + self.masses[1:]
 
+    velocities_of, velocities_back = from_bodies, to_bodies
+
 
 class Barycentric(NamedTuple):
     """Positions and velocities relative to the centre of mass of all."""
@@ -102,6 +104,8 @@ class Barycentric(NamedTuple):
 
     def central_mass(self) -> Array:
         return jnp.broadcast_to(jnp.sum(self.masses), self.masses[1:].shape)
+
+    velocities_of, velocities_back = from_bodies, to_bodies
 
 
 def _centre(masses: Array, x: Array) -> Array:

@@ -1,16 +1,31 @@
 """Elements of the orbits of N bodies."""
 
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from ...base.checks import array, instance, one_of, whole
+from lanewise.jaxprs.jaxapi import is_traced
+
+from ...base.checks import (
+    all_finite,
+    array,
+    in_range,
+    instance,
+    one_of,
+    only_one,
+    positive,
+    require,
+    whole,
+)
+from ...base.inputs import real_numbers
 from ...base.types import Args, Scalar, State
 from ..flows import value_of
 from ..frames import Barycentric, Heliocentric, Jacobi
-from ._orbit import Delaunay, Equinoctial, Keplerian, ModifiedEquinoctial, Poincare
+from ._orbit import Delaunay, Equinoctial, Keplerian, ModifiedEquinoctial, Poincare, real_array
 
 Frame = Literal["jacobi", "heliocentric", "barycentric"]
 _FRAMES = {"jacobi": Jacobi, "heliocentric": Heliocentric, "barycentric": Barycentric}
@@ -42,15 +57,21 @@ def of_bodies(
     # [ 5.2   9.54 19.2  30.07 39.49]
     ```
     """
-    q, p = jnp.asarray(q), jnp.asarray(p)
-    all_masses, scale = _masses(masses, q.shape[-2])
+    q, p = real_array("q", q), real_array("p", p)
+    one_of("the last axis of q", q.shape[-1:], ((2,), (3,)))
+    whole("the number of axes of q, (…, bodies, dim),", q.ndim, 2)
+    whole("the number of bodies", q.shape[-2], 2)
+    all_masses, scale, G = _masses(masses, q.shape[-2], G)
     array("p", p, q.shape)
     coordinates = _frame(frame)(all_masses)
     # Only the axis of the bodies is mixed; times and trajectories are before it.
-    rows = jnp.vectorize(coordinates.from_bodies, signature="(n,d)->(n,d)")
+    positions, velocities = (
+        jnp.vectorize(function, signature="(n,d)->(n,d)")
+        for function in (coordinates.from_bodies, coordinates.velocities_of)
+    )
     v = p / jnp.broadcast_to(scale[:, None], p.shape)
     mu = jnp.broadcast_to(G * coordinates.central_mass(), (*q.shape[:-2], q.shape[-2] - 1))
-    return _of_kind(kind).from_state(rows(q)[..., 1:, :], rows(v)[..., 1:, :], mu)
+    return _of_kind(kind).from_state(positions(q)[..., 1:, :], velocities(v)[..., 1:, :], mu)
 
 
 def to_bodies(
@@ -77,12 +98,12 @@ def to_bodies(
     instance("elements", elements, (*_KINDS.values(),), "elements, such as dvi.elements.Keplerian")
     elements = type(elements)(*jnp.broadcast_arrays(*map(jnp.asarray, elements)))
     array("the elements", elements[0], ("bodies − 1",), integers=True)
-    all_masses, scale = _masses(masses, len(elements[0]) + 1)
+    all_masses, scale, G = _masses(masses, len(elements[0]) + 1, G)
     coordinates = _frame(frame)(all_masses)
     # Row 0 is the centre of mass, for positions and velocities.
     state = elements.state(G * coordinates.central_mass(), dim)
-    q, v = (coordinates.to_bodies(jnp.concatenate([jnp.zeros((1, dim)), x])) for x in state)
-    return q, scale[:, None] * v
+    X, V = (jnp.concatenate([jnp.zeros((1, dim)), x]) for x in state)
+    return coordinates.to_bodies(X), scale[:, None] * coordinates.velocities_back(V)
 
 
 def _of_kind(kind: Any) -> Any:
@@ -98,6 +119,8 @@ class Elements(eqx.Module):
       it). None: q is one position, (2,) or (3,), and p the momentum for unit mass.
     - `mu`: without a `frame`, μ [length³/time²], a number or a function of args; None:
       ``args["mu"]``.
+
+    **Raises** `TypeError` for both, and for parameters that args lacks.
 
     Its value has the shape (bodies − 1, 6), without a frame (6,), the elements in their order.
 
@@ -121,14 +144,17 @@ class Elements(eqx.Module):
     mu: Any = None
 
     def __check_init__(self):
+        only_one(TypeError, frame=self.frame, mu=self.mu)
         if self.frame is not None:
             _frame(self.frame)
+        if not (self.mu is None or callable(self.mu) or is_traced(self.mu)):
+            positive("mu of elements.Elements", self.mu)
 
     def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Array:
         if self.frame is None:
-            mu = args["mu"] if self.mu is None else value_of(self.mu, args, q)
+            mu = _parameter(args, "mu") if self.mu is None else value_of(self.mu, args, q)
             return jnp.stack(self.kind.from_state(q, p, mu), -1)
-        masses, G = args["masses"], args.get("G", 1.0)
+        masses, G = _parameter(args, "masses"), args.get("G", 1.0)
         return jnp.stack(of_bodies(q, p, masses, G, frame=self.frame, kind=self.kind), -1)
 
 
@@ -136,10 +162,23 @@ def _frame(frame: Any) -> Any:
     return _FRAMES[one_of("frame", frame, get_args(Frame))]
 
 
-def _masses(masses: Any, bodies: int) -> tuple[Array, Array]:
-    """The masses of all bodies, and p/v, which is 1 for a test particle."""
-    masses = jnp.asarray(masses, jnp.result_type(float))
+def _parameter(args: Args, name: str) -> Any:
+    value = args.get(name) if isinstance(args, Mapping) else None
+    require("elements.Elements", {f"args[{name!r}]": value}, hint="Or give mu, or frame.")
+    return value
+
+
+def _masses(masses: Any, bodies: int, G: Any) -> tuple[Array, Array, Any]:
+    """The masses of all bodies, p/v, which is 1 for a test particle, and G."""
+    masses = real_numbers("masses", masses)
     array("masses", masses, ("bodies",))
+    if not is_traced(masses):
+        all_finite("the mass of body 0", masses[0], positive=True)
+        in_range("masses", masses, 0.0, np.finfo(float).max)
+    G = array("G", real_numbers("G", G), ())
+    if not is_traced(G):
+        positive("G", G)
     # The momentum of a test particle would be 0 and determine no velocity.
     tests = bodies - whole("the number of masses", len(masses), 1, bodies)
-    return jnp.pad(masses, (0, tests)), jnp.pad(masses, (0, tests), constant_values=1.0)
+    all_masses = jnp.pad(masses, (0, tests))
+    return all_masses, jnp.where(all_masses == 0, 1.0, all_masses), G

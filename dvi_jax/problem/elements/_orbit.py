@@ -4,11 +4,14 @@ import math
 from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 import lanewise
+from lanewise.jaxprs.jaxapi import is_traced
 
-from ...base.checks import array, one_of
+from ...base.checks import all_finite, array, in_range, one_of
+from ...base.inputs import real_numbers
 from ...engine.bracket import divide
 from .. import kepler as _kepler
 
@@ -38,7 +41,7 @@ class Keplerian(NamedTuple):
     @classmethod
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        plane = _plane(q, v)
+        plane, mu = _plane(q, v, mu)
         # Near the inclination π the orbit is turned about the x axis by π, to the inclination 0.
         flips = plane.momentum[..., 2] < 0
         sign = jnp.where(flips, -1.0, 1.0)[..., None]
@@ -66,9 +69,13 @@ class Keplerian(NamedTuple):
 
     def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
         """Position and velocity, of shape (…, dim)."""
-        a, e, inc, node, pericentre, M, mu = _same_shape(*self, mu)
+        a, e, inc, node, pericentre, M, mu = _same_shape(self, mu)
+        _in_range("e of elements.Keplerian", e, 0.0)
+        _positive("a (1 − e) of elements.Keplerian", a * (1 - e), _AXIS)
         time = jnp.where(a > 0, _wrap(M), M) * jnp.sqrt(jnp.abs(a) ** 3 / mu)
-        q, v, is_root = _kepler.from_pericentre(time, a * (1 - e), 1 / a, mu)
+        # One orbit at a time: all together have one status, and one of them may be NaN.
+        position = jnp.vectorize(_kepler.from_pericentre, signature="(),(),(),()->(d),(d),()")
+        q, v, is_root = position(time, a * (1 - e), 1 / a, mu)
         good = is_root & (e >= 0)
 
         def in_space(x):
@@ -95,7 +102,7 @@ class ModifiedEquinoctial(NamedTuple):
     @classmethod
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        q, v, momentum, _ = _plane(q, v)
+        (q, v, momentum, _), mu = _plane(q, v, mu)
         size = jnp.sqrt(jnp.sum(momentum**2, -1))
         w = momentum / size[..., None]
         hx, hy = (x / (1 + w[..., 2]) for x in (-w[..., 1], w[..., 0]))
@@ -109,10 +116,13 @@ class ModifiedEquinoctial(NamedTuple):
 
     def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
         """Position and velocity, of shape (…, dim)."""
-        p, ex, ey, hx, hy, longitude, mu = _same_shape(*self, mu)
+        p, ex, ey, hx, hy, longitude, mu = _same_shape(self, mu)
         cosine, sine = jnp.cos(longitude), jnp.sin(longitude)
-        r, speed = p / (1 + ex * cosine + ey * sine), jnp.sqrt(mu / p)
-        r = jnp.where(r > 0, r, jnp.nan)  # a direction beyond the asymptotes of a hyperbola
+        r = p / (1 + ex * cosine + ey * sine)
+        _positive("p of elements.ModifiedEquinoctial", p)
+        _positive("p/(1 + e cos f)", r, "The longitude is beyond the asymptotes of the hyperbola.")
+        speed = jnp.sqrt(jnp.where(r > 0, mu / p, jnp.nan))
+        r = jnp.where(r > 0, r, jnp.nan)
         velocity = -speed * (sine + ey), speed * (cosine + ex)
         return _in_space(dim, hx, hy, (r * cosine, r * sine), velocity)
 
@@ -130,6 +140,7 @@ class Equinoctial(NamedTuple):
     @classmethod
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
+        (q, v, *_), mu = _plane(q, v, mu)
         p, ex, ey, hx, hy, true_longitude = ModifiedEquinoctial.from_state(q, v, mu)
         r, rv, alpha = _energy(q, v, mu)
         x, y = r * jnp.cos(true_longitude), r * jnp.sin(true_longitude)
@@ -150,8 +161,9 @@ class Equinoctial(NamedTuple):
 
     def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
         """Position and velocity, of shape (…, dim)."""
-        a, ex, ey, hx, hy, longitude, mu = _same_shape(*self, mu)
+        a, ex, ey, hx, hy, longitude, mu = _same_shape(self, mu)
         e2 = ex * ex + ey * ey
+        _positive("a (1 − e²) of elements.Equinoctial", a * (1 - e2), _AXIS)
         is_small = e2 < 0.25
         # Near the circle the pericentre is undefined; far from it the other iteration is slow.
         small = jnp.where(is_small, ex, 0.0), jnp.where(is_small, ey, 0.0)
@@ -186,7 +198,8 @@ class Delaunay(NamedTuple):
     @classmethod
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        kepler, momentum = Keplerian.from_state(q, v, mu), _plane(q, v).momentum
+        (q, v, momentum, _), mu = _plane(q, v, mu)
+        kepler = Keplerian.from_state(q, v, mu)
         # On a circle rounding may make G larger than L, and e the root of a negative number.
         L = _action(kepler.a, mu)
         G = jnp.minimum(jnp.sqrt(jnp.sum(momentum**2, -1)), L)
@@ -194,7 +207,10 @@ class Delaunay(NamedTuple):
 
     def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
         """Position and velocity, of shape (…, dim)."""
-        M, omega, node, L, G, H, mu = _same_shape(*self, mu)
+        M, omega, node, L, G, H, mu = _same_shape(self, mu)
+        _positive("G of elements.Delaunay", G)
+        _in_range("G/L of elements.Delaunay", G / L, 0.0, 1.0)
+        _in_range("H/G of elements.Delaunay", H / G, -1.0, 1.0)
         e = jnp.sqrt((L - G) * (L + G)) / L
         inc = 2 * jnp.arctan2(jnp.sqrt(G - H), jnp.sqrt(G + H))
         return Keplerian(L * L / mu, e, inc, node, omega, M).state(mu, dim)
@@ -219,9 +235,9 @@ class Poincare(NamedTuple):
     @classmethod
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
+        (q, v, momentum, _), mu = _plane(q, v, mu)
         a, ex, ey, hx, hy, longitude = Equinoctial.from_state(q, v, mu)
         action = _action(a, mu)
-        momentum = _plane(q, v).momentum
         G = jnp.sqrt(jnp.sum(momentum**2, -1))
         scale = jnp.sqrt(2 * action / (1 + G / action))
         lift = jnp.sqrt(4 * G / (1 + hx * hx + hy * hy))
@@ -229,9 +245,11 @@ class Poincare(NamedTuple):
 
     def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
         """Position and velocity, of shape (…, dim)."""
-        longitude, eta, q, action, xi, p, mu = _same_shape(*self, mu)
+        longitude, eta, q, action, xi, p, mu = _same_shape(self, mu)
         # Without the differences 1 − √(1 − e²) and 1 − cos i, which lose digits of small e and i.
         G = action - (xi * xi + eta * eta) / 2
+        _positive("G = Λ − (ξ² + η²)/2 of elements.Poincare", G)
+        _positive("4 G − p² − q² of elements.Poincare", 4 * G - (p * p + q * q))
         scale = jnp.sqrt((1 + G / action) / (2 * action))
         # tan²(i/2) = Z/(2G − Z) with Z = (p² + q²)/2
         lift = 1 / jnp.sqrt(4 * G - (p * p + q * q))
@@ -248,14 +266,32 @@ class _Plane(NamedTuple):
     dim: int
 
 
-def _plane(q: Any, v: Any) -> _Plane:
-    q, v = jnp.asarray(q), jnp.asarray(v)
+def _plane(q: Any, v: Any, mu: Any) -> tuple[_Plane, Array]:
+    """**Raises** `TypeError` for other than real numbers, `ValueError` for another shape, or a
+    known μ that is not positive."""
+    q, v, mu = _of_one_type({"q": q, "v": v, "mu": mu})
     one_of("the last axis of q", q.shape[-1:], ((2,), (3,)))
     array("v", v, q.shape)
+    _positive("mu", array("mu", mu, *{(), q.shape[:-1]}, empty=True))
     dim = q.shape[-1]
     if dim == 2:
         q, v = (jnp.concatenate([x, jnp.zeros_like(x[..., :1])], -1) for x in (q, v))
-    return _Plane(q, v, jnp.cross(q, v), dim)
+    return _Plane(q, v, jnp.cross(q, v), dim), mu
+
+
+_AXIS = "Ellipses have e < 1 and a > 0, hyperbolas e > 1 and a < 0; e = 1 is a ModifiedEquinoctial."
+
+
+def _positive(name: str, values: Array, hint: str = "") -> None:
+    """**Raises** `ValueError` for a known number that is not positive and finite. NaN, such as of a
+    trajectory that failed, gives NaN."""
+    if not is_traced(values):
+        all_finite(name, np.where(np.isnan(values), 1.0, values), True, hint)
+
+
+def _in_range(name: str, values: Array, low: float, high: float = math.inf, hint: str = "") -> None:
+    if not is_traced(values):
+        in_range(name, np.where(np.isnan(values), low, values), low, high, hint)
 
 
 def _axes(hx: Array, hy: Array) -> tuple[Array, Array]:
@@ -275,6 +311,10 @@ def _in_space(dim: int, hx: Array, hy: Array, *vectors: Any) -> tuple[Array, Arr
 
 def _of_dim(dim: int, q: Array, v: Array) -> tuple[Array, Array]:
     one_of("dim", dim, (2, 3))
+    if dim == 2:
+        for x in (q, v):
+            tilt = x[..., 2] / jnp.sqrt(jnp.sum(x * x, -1))
+            _in_range("z/r with dim=2", tilt, -1e-9, 1e-9, "The inclination must be 0 or π.")
     return q[..., :dim], v[..., :dim]
 
 
@@ -342,6 +382,29 @@ def _wrap(angle: Array) -> Array:
     return angle - 2 * math.pi * jnp.round(angle / (2 * math.pi))
 
 
-def _same_shape(*values: Any) -> list[Array]:
-    dtype = jnp.result_type(*values, 0.0)
-    return jnp.broadcast_arrays(*(jnp.asarray(x, dtype) for x in values))
+def _same_shape(elements: Any, mu: Any) -> list[Array]:
+    """The elements and μ as arrays of one shape. **Raises** errors as `_plane` does."""
+    label = f"of elements.{type(elements).__name__}"
+    names = [*(f"{name} {label}" for name in elements._fields), "mu"]
+    arrays = _of_one_type(dict(zip(names, (*elements, mu), strict=True)))
+    _positive("mu", arrays[-1])
+    shape: tuple[int, ...] = ()
+    for name, x in zip(names, arrays, strict=True):
+        # Axes of length 1 are repeated, as in NumPy.
+        pairs = zip(shape[::-1], x.shape[::-1], strict=False)
+        array(name, x, x.shape if all(n == m or 1 in (n, m) for n, m in pairs) else shape)
+        shape = np.broadcast_shapes(shape, x.shape)
+    return [jnp.broadcast_to(x, shape) for x in arrays]
+
+
+def _of_one_type(values: dict[str, Any]) -> list[Array]:
+    arrays = [x if isinstance(x, float) else real_array(name, x) for name, x in values.items()]
+    dtype = jnp.result_type(*arrays, 0.0)
+    return [jnp.asarray(x, dtype) for x in arrays]
+
+
+def real_array(name: str, value: Any) -> Array:
+    """An array of a floating-point type. **Raises** `TypeError` for other than real numbers."""
+    real_numbers(name, value)
+    entries = jnp.asarray(value)
+    return entries.astype(jnp.result_type(entries, 0.0))

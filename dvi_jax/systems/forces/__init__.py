@@ -20,8 +20,11 @@ from ._dissipation import (
 from ._gravity import (
     GalacticTide as GalacticTide,
     Harmonics as Harmonics,
-    LenseThirring as LenseThirring,
     MassLoss as MassLoss,
-    Relativity as Relativity,
     ThirdBody as ThirdBody,
+)
+from ._relativity import (
+    LenseThirring as LenseThirring,
+    PostNewtonian as PostNewtonian,
+    Relativity as Relativity,
 )

@@ -2,18 +2,24 @@
 
 import abc
 import dataclasses
+import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ...base.checks import array, instance, one_of, whole
+from lanewise.jaxprs.jaxapi import is_traced
+
+from ...base.checks import array, finite, function, instance, known, one_of, positive, whole
 from ...base.types import Args, Scalar, State
 from ...problem.flows import value_of
 from ...problem.system import System
-from .._problem import Problem, parameter
+from .._problem import Problem, nonzero, parameter
 from ..n_body import masses_of
 
 
@@ -26,8 +32,32 @@ class Bodies(NamedTuple):
     scale: Array
 
 
+def quantity(check: Callable[[str, Any], Any], **options: Any) -> Any:
+    """The field of a parameter, a number or a function of args; `check`: of each of its values that
+    is not traced, at construction."""
+    return eqx.field(metadata={"check": check}, **options)
+
+
+def check_values(name: str, value: Any, check: Callable[[str, Any], Any]) -> None:
+    """`check` of each number of a parameter. **Raises** `ValueError` or `TypeError`."""
+    if callable(value):
+        function(name, value, "(args)", hint="Or give a number.")
+    elif not any(map(is_traced, jax.tree.leaves(value))):
+        for x in known(name, value).ravel().tolist():
+            check(name, x)
+
+
+def time_scale(name: str, value: Any) -> None:
+    """A number that is not zero; infinite: no change."""
+    nonzero(name, 1.0 if value in (math.inf, -math.inf) else value)
+
+
+not_negative = partial(positive, zero=True)
+
+
 def bodies_of(q: State, p: State, args: Args) -> Bodies:
     """The bodies of a state. G is in the masses: they are G m [length³/time²]."""
+    one_of("the last axis of q", q.shape[-1:], ((2,), (3,)))
     if q.ndim == 1:  # a satellite: a body without mass, and the centre at the origin
         masses = jnp.asarray([parameter(args, "mu"), 0.0], q.dtype)
         x, v = (jnp.stack([jnp.zeros_like(x), x]) for x in (q, p))
@@ -37,13 +67,6 @@ def bodies_of(q: State, p: State, args: Args) -> Bodies:
     masses_of(q[: len(masses)], args)
     scale = jnp.pad(masses, tests, constant_values=1.0)
     return Bodies(q, p / scale[:, None], args.get("G", 1.0) * jnp.pad(masses, tests), scale)
-
-
-def vector(name: str, value: Any, args: Args, like: Array) -> Array:
-    """The value of a parameter that is a vector, for each row of `like`. **Raises** `ValueError`
-    for another shape."""
-    value = value_of(value, args, like)
-    return jnp.broadcast_to(array(name, value, like.shape[-1:])[None], like.shape)
 
 
 class Force(eqx.Module):
@@ -56,7 +79,33 @@ class Force(eqx.Module):
 
     ``f + g`` is the sum of two forces and ``a * f`` a force with a strength a, a number or a
     function of args. `add_to` adds a force to a problem.
+
+    **Raises** `ValueError` for a parameter that is not finite, has a wrong sign, or (in a run) a
+    wrong shape, if its value is not traced by JAX; `TypeError` for what is not a number.
     """
+
+    # An array of NumPy that is multiplied by a force leaves the product to it.
+    __array_ufunc__: ClassVar[None] = None
+
+    def __check_init__(self):
+        for field in dataclasses.fields(self):
+            if "check" in field.metadata:
+                name = self._label(field.name)
+                check_values(name, getattr(self, field.name), field.metadata["check"])
+
+    def _label(self, name: str) -> str:
+        return f"{name} of forces.{type(self).__name__}"
+
+    def value(self, name: str, args: Args, like: Array, *shapes: tuple[int, ...]) -> Array:
+        """The value of a parameter in the precision of `like`, of one of the shapes, by default a
+        number. **Raises** `ValueError` for another shape."""
+        value = value_of(getattr(self, name), args, like)
+        return array(self._label(name), value, *(shapes or ((),)))
+
+    def each(self, name: str, args: Args, like: Array) -> Array:
+        """The value of a parameter of all bodies or of each, shape (bodies, 1)."""
+        bodies = like.shape[:1]
+        return jnp.broadcast_to(self.value(name, args, like, (), bodies), bodies)[:, None]
 
     @abc.abstractmethod
     def accelerations(self, t: Scalar, bodies: Bodies, args: Args) -> Array:
@@ -70,8 +119,13 @@ class Force(eqx.Module):
     def __add__(self, other: Any) -> "Force":
         return NotImplemented if not isinstance(other, Force) else Sum((self, other))
 
-    def __rmul__(self, strength: Any) -> "Force":
-        return Multiple(strength, self)
+    def __radd__(self, other: Any) -> "Force":
+        return self if isinstance(other, int) and other == 0 else NotImplemented  # sum([f, g])
+
+    def __mul__(self, strength: Any) -> "Force":
+        return NotImplemented if isinstance(strength, Force) else Multiple(self, strength)
+
+    __rmul__ = __mul__
 
     def add_to(self, problem: Problem, epsilon: float = 1.0) -> Problem:
         """The problem with this force, next to the forces that it has; ε of its runs is `epsilon`.
@@ -101,11 +155,11 @@ class Sum(Force):
 class Multiple(Force):
     """A force times a strength, which is a number or a function of args."""
 
-    strength: Any
     force: Force
+    strength: Any = quantity(finite)
 
     def accelerations(self, t, bodies, args):
-        factor = value_of(self.strength, args, bodies.x)
+        factor = self.value("strength", args, bodies.x)
         return factor * self.force.accelerations(t, bodies, args)
 
 
@@ -118,6 +172,13 @@ class _Pair(eqx.Module):
         return self.epsilon * self.first(*step) + self.second(*step)
 
 
+def _indices(on_bodies: Any) -> tuple[int, ...] | None:
+    if on_bodies is None:
+        return None
+    entries = np.atleast_1d(known("on_bodies", on_bodies)).tolist()
+    return tuple(dict.fromkeys(whole("each of on_bodies", i, 0) for i in entries))
+
+
 class Central(Force):
     """A force on bodies that depends on their motion relative to one of them, the centre.
 
@@ -126,7 +187,7 @@ class Central(Force):
     """
 
     centre: int = eqx.field(static=True, default=0, kw_only=True)
-    on_bodies: tuple[int, ...] | None = eqx.field(static=True, default=None, kw_only=True)
+    on_bodies: Any = eqx.field(static=True, default=None, converter=_indices, kw_only=True)
 
     has_recoil: ClassVar[bool] = True
     """Whether the centre feels the opposite force."""
@@ -143,7 +204,7 @@ class Central(Force):
         count, c = len(bodies.x), whole("centre", self.centre, 0, len(bodies.x) - 1)
         all_others = [i for i in range(count) if i != c]
         indices = all_others if self.on_bodies is None else self.on_bodies
-        others = np.array([one_of("each of on_bodies", i, all_others) for i in indices])
+        others = np.array([one_of("each of on_bodies", i, all_others) for i in indices], int)
         r, v = (x[others] - x[c][None] for x in (bodies.x, bodies.v))
         masses = bodies.masses[others]
         a = self.relative(t, r, v, bodies.masses[c], masses, args)

@@ -1,14 +1,14 @@
 """Forces that change energies: tides, radiation, drag, migration, outgassing."""
 
+import math
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from ...base.checks import function
-from ...problem.flows import value_of
-from ._base import Central
+from ...base.checks import array, finite, positive
+from ...base.signature import check_takes, notes_of
+from ._base import Central, not_negative, quantity, time_scale
 
 
 class Tides(Central):
@@ -25,16 +25,16 @@ class Tides(Central):
     583, A116.
     """
 
-    k2: Any
-    lag: Any
-    radius: Any
-    spin: Any = (0.0, 0.0, 0.0)
+    k2: Any = quantity(not_negative)
+    lag: Any = quantity(not_negative)
+    radius: Any = quantity(positive)
+    spin: Any = quantity(finite, default=(0.0, 0.0, 0.0))
 
     def relative(self, t, r, v, mu, masses, args):
-        lag, radius = value_of(self.lag, args, r), value_of(self.radius, args, r)
+        k2, lag, radius = (self.value(name, args, r) for name in ("k2", "lag", "radius"))
         r2, rv = (jnp.sum(r * x, -1, keepdims=True) for x in (r, v))
-        size = 3 * masses[:, None] * value_of(self.k2, args, r) * radius**5 / r2**4
-        spin = jnp.broadcast_to(value_of(self.spin, args, r), (len(r), 3))
+        size = 3 * masses[:, None] * k2 * radius**5 / r2**4
+        spin = jnp.broadcast_to(self.value("spin", args, r, (3,)), (len(r), 3))
         if r.shape[-1] == 2:  # a plane orbit: the spin about z
             turn = spin[:, 2:] * jnp.stack([-r[:, 1], r[:, 0]], -1)
         else:
@@ -53,14 +53,17 @@ class Radiation(Central):
     **Source** Burns, Lamy & Soter 1979, *Icarus* 40, 1, (5).
     """
 
-    beta: Any
-    c: Any
+    beta: Any = quantity(not_negative)
+    c: Any = quantity(positive)
 
     has_recoil: ClassVar[bool] = False
 
     def relative(self, t, r, v, mu, masses, args):
-        beta = jnp.broadcast_to(value_of(self.beta, args, r), r.shape[:1])[:, None]
-        c, r2 = value_of(self.c, args, r), jnp.sum(r * r, -1, keepdims=True)
+        beta, c, r2 = (
+            self.each("beta", args, r),
+            self.value("c", args, r),
+            jnp.sum(r * r, -1, keepdims=True),
+        )
         unit = r / jnp.sqrt(r2)
         rate = jnp.sum(unit * v, -1, keepdims=True)
         return beta * mu / r2 * ((1 - rate / c) * unit - v / c)
@@ -80,14 +83,13 @@ class Damping(Central):
     183.
     """
 
-    tau_a: Any = np.inf
-    tau_e: Any = np.inf
-    tau_inc: Any = np.inf
+    tau_a: Any = quantity(time_scale, default=math.inf)
+    tau_e: Any = quantity(time_scale, default=math.inf)
+    tau_inc: Any = quantity(time_scale, default=math.inf)
 
     def relative(self, t, r, v, mu, masses, args):
-        taus = self.tau_a, self.tau_e, self.tau_inc
-        rates = (1 / jnp.broadcast_to(value_of(tau, args, r), r.shape[:1])[:, None] for tau in taus)
-        of_a, of_e, of_inc = rates
+        names = "tau_a", "tau_e", "tau_inc"
+        of_a, of_e, of_inc = (1 / self.each(name, args, r) for name in names)
         rv, r2 = jnp.sum(r * v, -1, keepdims=True), jnp.sum(r * r, -1, keepdims=True)
         a = of_a / 2 * v + 2 * rv / r2 * of_e * r
         a = a.at[:, 2:].add(2 * of_inc * v[:, 2:])
@@ -106,21 +108,25 @@ class Drag(Central):
     """
 
     density: Any
-    ballistic: Any
-    rate: Any = 0.0
+    ballistic: Any = quantity(not_negative)
+    rate: Any = quantity(finite, default=0.0)
 
     has_recoil: ClassVar[bool] = False
 
     def __check_init__(self):
-        function("density of Drag", self.density, "(r, args)")
+        check_takes("density of Drag", self.density, "(r, args)")
 
     def relative(self, t, r, v, mu, masses, args):
-        rate = value_of(self.rate, args, r)
+        def density(r):
+            with notes_of("density of Drag"):
+                value = jnp.asarray(self.density(r, args), r.dtype)
+            return array("density of Drag", value, (), verb="return")
+
+        rate, rho = self.value("rate", args, r), jax.vmap(density)(r)[:, None]
         wind = jnp.zeros_like(r).at[:, 0].set(-rate * r[:, 1]).at[:, 1].set(rate * r[:, 0])
-        rho = jax.vmap(lambda r: jnp.asarray(self.density(r, args), r.dtype))(r)[:, None]
         w = v - wind
         speed = jnp.sqrt(jnp.sum(w * w, -1, keepdims=True))
-        return -value_of(self.ballistic, args, r) / 2 * rho * speed * w
+        return -self.value("ballistic", args, r) / 2 * rho * speed * w
 
 
 class Outgassing(Central):
@@ -135,16 +141,17 @@ class Outgassing(Central):
     *Icarus* 224, 1.
     """
 
-    A1: Any = 0.0
-    A2: Any = 0.0
-    A3: Any = 0.0
-    r0: Any = 1.0
-    power: Any = 2.0
+    A1: Any = quantity(finite, default=0.0)
+    A2: Any = quantity(finite, default=0.0)
+    A3: Any = quantity(finite, default=0.0)
+    r0: Any = quantity(positive, default=1.0)
+    power: Any = quantity(finite, default=2.0)
 
     has_recoil: ClassVar[bool] = False
 
     def relative(self, t, r, v, mu, masses, args):
-        A1, A2, A3 = (value_of(A, args, r) for A in (self.A1, self.A2, self.A3))
+        names = "A1", "A2", "A3", "r0", "power"
+        A1, A2, A3, r0, power = (self.value(name, args, r) for name in names)
         if r.shape[-1] == 2:
             zeros = jnp.zeros_like(r[:, :1])
             r3, v3 = (jnp.concatenate([x, zeros], -1) for x in (r, v))
@@ -153,6 +160,6 @@ class Outgassing(Central):
         distance = jnp.sqrt(jnp.sum(r3 * r3, -1, keepdims=True))
         L = jnp.cross(r3, v3)
         radial, normal = r3 / distance, L / jnp.sqrt(jnp.sum(L * L, -1, keepdims=True))
-        size = (value_of(self.r0, args, r) / distance) ** value_of(self.power, args, r)
+        size = (r0 / distance) ** power
         a = A1 * radial + A2 * jnp.cross(normal, radial) + A3 * normal
         return (size * a)[:, : r.shape[-1]]

@@ -1,4 +1,4 @@
-"""Gravity beyond that of points: the shape of a body, other bodies, lost mass, relativity."""
+"""Gravity beyond that of points: the shape of a body, other bodies, lost mass."""
 
 import math
 from collections.abc import Mapping
@@ -7,11 +7,26 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from ...base.checks import function, whole
+from lanewise.jaxprs.jaxapi import is_traced
+
+from ...base.checks import array, finite, instance, known, positive, whole
+from ...base.signature import check_takes, notes_of
 from ...problem.flows import value_of
-from ._base import Central, bodies_of, vector
+from ._base import Central, bodies_of, check_values, not_negative, quantity, time_scale
+
+
+def _direction(name: str, force: Any, args: Any, r: Array) -> Array:
+    """The unit vector along a parameter, in the dimensions of r."""
+    vector = force.value(name, args, r, r.shape[-1:])
+    return vector / jnp.sqrt(jnp.sum(vector * vector))
+
+
+def _check_direction(name: str, vector: Any) -> None:
+    if not (callable(vector) or any(map(is_traced, jax.tree.leaves(vector)))):
+        positive(f"the length of {name}", np.sum(np.abs(known(name, vector, float))))
 
 
 class Harmonics(Central):
@@ -26,6 +41,9 @@ class Harmonics(Central):
       the prime meridian at t = 0 [rad], from the node of the equator on the (x, y) plane, or from
       the x axis if the pole is z.
 
+    In the plane the pole has two components, the equator contains the normal of the plane, and
+    there are no tesseral harmonics.
+
     `energy` is Σ m_i Φ as a discrete Hamiltonian, for a `System` with `perturbation=`, of bodies
     with a mass.
 
@@ -34,18 +52,25 @@ class Harmonics(Central):
     **Source** Pines 1973, *AIAA J.* 11, 1508 (the recursion).
     """
 
-    radius: Any
+    radius: Any = quantity(positive)
     zonal: Mapping[int, Any] = eqx.field(default_factory=dict)
     tesseral: Mapping[tuple[int, int], Any] = eqx.field(default_factory=dict)
-    pole: Any = (0.0, 0.0, 1.0)
-    rate: Any = 0.0
-    angle: Any = 0.0
+    pole: Any = quantity(finite, default=(0.0, 0.0, 1.0))
+    rate: Any = quantity(finite, default=0.0)
+    angle: Any = quantity(finite, default=0.0)
     normalised: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
+        instance("zonal", self.zonal, Mapping, "a dict {n: J_n}")
+        instance("tesseral", self.tesseral, Mapping, "a dict {(n, m): (C_nm, S_nm)}")
+        for key in self.tesseral:
+            array("each key (n, m) of tesseral", known("tesseral", key), (2,), integers=True)
         for n, m in [*((n, 0) for n in self.zonal), *self.tesseral]:
             whole("the degree of a harmonic", n, 2)
             whole("the order of a harmonic", m, 0, n)
+        for key, value in [*self.zonal.items(), *self.tesseral.items()]:
+            check_values(f"harmonic {key}", value, finite)
+        _check_direction("pole of forces.Harmonics", self.pole)
 
     def relative(self, t, r, v, mu, masses, args):
         axes = self._axes(t, r, args)
@@ -61,27 +86,28 @@ class Harmonics(Central):
 
     def _axes(self, t: Any, r: Array, args: Any) -> Array:
         """The axes of the body, as rows."""
-        pole = vector("pole of Harmonics", self.pole, args, r)[0]
-        z = pole / jnp.sqrt(jnp.sum(pole * pole))
+        z = _direction("pole", self, args, r)
+        z = jnp.pad(z, (0, 3 - len(z)))
         level = jnp.sqrt(z[0] * z[0] + z[1] * z[1])
         is_up = level == 0
         inverse = 1 / jnp.where(is_up, 1.0, level)
         node = jnp.stack(
             [jnp.where(is_up, 1.0, -z[1] * inverse), z[0] * inverse, jnp.zeros_like(inverse)]
         )
-        angle = value_of(self.angle, args, r) + value_of(self.rate, args, r) * t
+        angle = self.value("angle", args, r) + self.value("rate", args, r) * t
         cosine, sine, other = jnp.cos(angle), jnp.sin(angle), jnp.cross(z, node)
         return jnp.stack([cosine * node + sine * other, cosine * other - sine * node, z])
 
     def _potential(self, r: Array, axes: Array, mu: Array, args: Any) -> Array:
-        x, y, z = axes @ r
+        x, y, z = axes[:, : len(r)] @ r
         distance = jnp.sqrt(jnp.sum(r * r))
-        s, ratio = z / distance, value_of(self.radius, args, r) / distance
+        s, ratio = z / distance, self.value("radius", args, r) / distance
         terms: dict[tuple[int, int], Any] = {}
         for n, J in self.zonal.items():
-            terms[n, 0] = (-value_of(J, args, r), 0.0)
+            terms[n, 0] = (-array(f"harmonic {n}", value_of(J, args, r), ()), 0.0)
         for (n, m), pair in self.tesseral.items():
-            C, S = value_of(pair, args, r)
+            array("positions with tesseral harmonics", r, (3,))
+            C, S = array(f"harmonic {(n, m)}", value_of(pair, args, r), (2,))
             of_zonal, _ = terms.get((n, m), (0.0, 0.0))
             terms[n, m] = (of_zonal + C, S)
         total = jnp.zeros_like(distance)
@@ -125,19 +151,21 @@ class ThirdBody(Central):
     """
 
     path: Any
-    mu: Any
+    mu: Any = quantity(not_negative)
 
     has_recoil: ClassVar[bool] = False
 
     def __check_init__(self):
-        function("path of ThirdBody", self.path, "(t, args)")
+        check_takes("path of ThirdBody", self.path, "(t, args)")
 
     def relative(self, t, r, v, mu, masses, args):
-        d = vector("the value of path of ThirdBody", self.path(t, args), args, r)
+        with notes_of("path of ThirdBody"):
+            d = jnp.asarray(self.path(t, args), r.dtype)
+        d = jnp.broadcast_to(array("path of ThirdBody", d, r.shape[-1:], verb="return"), r.shape)
         x = jnp.sum(r * (r - 2 * d), -1, keepdims=True) / jnp.sum(d * d, -1, keepdims=True)
         difference = x * (3 + x * (3 + x)) / (1 + (1 + x) * jnp.sqrt(1 + x))
         apart = jnp.sqrt(jnp.sum((r - d) ** 2, -1, keepdims=True))
-        return -value_of(self.mu, args, r) / apart**3 * (r + difference * d)
+        return -self.value("mu", args, r) / apart**3 * (r + difference * d)
 
 
 class GalacticTide(Central):
@@ -148,15 +176,17 @@ class GalacticTide(Central):
     **Source** Heisler & Tremaine 1986, *Icarus* 65, 13: the largest of its terms.
     """
 
-    strength: Any
-    pole: Any = (0.0, 0.0, 1.0)
+    strength: Any = quantity(not_negative)
+    pole: Any = quantity(finite, default=(0.0, 0.0, 1.0))
 
     has_recoil: ClassVar[bool] = False
 
+    def __check_init__(self):
+        _check_direction("pole of forces.GalacticTide", self.pole)
+
     def relative(self, t, r, v, mu, masses, args):
-        pole = vector("pole of GalacticTide", self.pole, args, r)
-        n = pole / jnp.sqrt(jnp.sum(pole * pole, -1, keepdims=True))
-        return -value_of(self.strength, args, r) * jnp.sum(r * n, -1, keepdims=True) * n
+        n = _direction("pole", self, args, r)[None]
+        return -self.value("strength", args, r) * jnp.sum(r * n, -1, keepdims=True) * n
 
 
 class MassLoss(Central):
@@ -169,56 +199,10 @@ class MassLoss(Central):
     **Source** Hadjidemetriou 1963, *Icarus* 2, 440.
     """
 
-    timescale: Any
+    timescale: Any = quantity(time_scale)
 
     has_recoil: ClassVar[bool] = False
 
     def relative(self, t, r, v, mu, masses, args):
         distance = jnp.sqrt(jnp.sum(r * r, -1, keepdims=True))
-        return -mu * jnp.expm1(t / value_of(self.timescale, args, r)) / distance**3 * r
-
-
-class Relativity(Central):
-    r"""General relativity of the central mass in harmonic coordinates, to first order in 1/c².
-
-        a = μ/(c² r³) [(4 μ/r − v²) r + 4 (r·v) v]
-
-    - `c`: the velocity of light [length/time], a number or a function of args.
-
-    The centre feels nothing: total momentum changes by a fraction m_i/m_0 of the force.
-
-    **Source** see `dvi_jax.systems.planets.relativity.post_newtonian_force`.
-    """
-
-    c: Any
-
-    has_recoil: ClassVar[bool] = False
-
-    def relative(self, t, r, v, mu, masses, args):
-        distance = jnp.sqrt(jnp.sum(r * r, -1, keepdims=True))
-        rv, v2 = jnp.sum(r * v, -1, keepdims=True), jnp.sum(v * v, -1, keepdims=True)
-        size = mu / (value_of(self.c, args, r) ** 2 * distance**3)
-        return size * ((4 * mu / distance - v2) * r + 4 * rv * v)
-
-
-class LenseThirring(Central):
-    r"""The rotation of the central mass in general relativity: a = 2 Ω × v.
-
-        Ω = (2/(c² r³)) [3 (J·r) r/r² − J]/2 · G
-
-    - `momentum`: G J, G times the angular momentum of the centre [length⁵/time³], shape (3,).
-    - `c`: the velocity of light [length/time]. Numbers or functions of args.
-
-    **Source** IERS Conventions 2010, (10.12).
-    """
-
-    momentum: Any
-    c: Any
-
-    has_recoil: ClassVar[bool] = False
-
-    def relative(self, t, r, v, mu, masses, args):
-        J = vector("momentum of LenseThirring", self.momentum, args, r)
-        r2 = jnp.sum(r * r, -1, keepdims=True)
-        radial = 3 * jnp.sum(J * r, -1, keepdims=True) / r2 * r
-        return 2 / (value_of(self.c, args, r) ** 2 * r2**1.5) * jnp.cross(radial - J, v)
+        return -mu * jnp.expm1(t / self.value("timescale", args, r)) / distance**3 * r

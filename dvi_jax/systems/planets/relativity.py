@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ...base.checks import array
+from ..forces import Harmonics, Relativity
 from ..n_body import hamiltonian, masses_of
 from .solar_system import AU_IN_KM
 
@@ -47,15 +47,10 @@ def post_newtonian_force(t0, t1, q0, p1, args):
     Neglected: the recoil of the Sun, a fraction m_i/M of the force (so total momentum is not
     conserved), the relativity of the other bodies, of the same order, and O(1/c⁴).
 
-    **Source** the Schwarzschild term in harmonic coordinates, those of the ephemerides: IERS
-    Conventions 2010, (10.12) with β = γ = 1; Anderson et al. 1975, *Astrophys. J.* 200, 221.
+    It is `dvi.forces.Relativity`, with the default c; `dvi.forces.PostNewtonian` has all terms.
     """
-    masses, mu = _masses(q0, args)
-    r, v = _from_sun(q0), _from_sun(p1 / masses[:, None])
-    distance, rv = _length(r), jnp.sum(r * v, axis=-1, keepdims=True)
-    v2 = jnp.sum(v**2, axis=-1, keepdims=True)
-    a = mu / (_c2(args) * distance**3) * ((4 * mu / distance - v2) * r + 4 * rv * v)
-    return jnp.concatenate([jnp.zeros_like(q0[:1]), masses[1:, None] * a])
+    masses_of(q0, args)
+    return _RELATIVITY(t0, t1, q0, p1, args)
 
 
 def post_newtonian_hamiltonian(t0, t1, q0, p1, args):
@@ -81,7 +76,7 @@ def post_newtonian_hamiltonian(t0, t1, q0, p1, args):
     r, v = _length(_from_sun(q0)), _from_sun(p1 / masses[:, None])
     v2 = jnp.sum(v**2, axis=-1, keepdims=True)
     terms = v2**2 / 8 + 1.5 * mu * v2 / r - mu**2 / (2 * r**2)
-    return -jnp.sum(masses[1:, None] * terms) / _c2(args)
+    return -jnp.sum(masses[1:, None] * terms) / _c(args) ** 2
 
 
 def momenta_from_velocities(q: Any, v: Any, args: Any):
@@ -126,19 +121,15 @@ def oblateness(q, args):
     Total momentum is conserved. The Sun's axis is fixed, so that only the component of angular
     momentum along the pole is conserved.
 
-    **Raises** `ValueError` also when the shapes of q and the pole do not agree.
+    **Raises** `ValueError` also when the shapes of q and the pole do not agree; in the plane it
+    must be given.
 
-    **Source** potential −(GM/r) [1 − J2 (R/r)² P₂(sin φ)], sin φ = r·n/r: Murray & Dermott 1999,
-    *Solar System Dynamics*, 6.11.
+    It is `dvi.forces.Harmonics`, with the Sun's defaults. **Source** potential
+    −(GM/r) [1 − J2 (R/r)² P₂(sin φ)], sin φ = r·n/r: Murray & Dermott 1999, *Solar System
+    Dynamics*, 6.11.
     """
-    masses, mu = _masses(q, args)
-    pole = jnp.asarray(args.get("pole", SUN_POLE), q.dtype)
-    array('args["pole"]', pole, q.shape[1:], hint="In the plane it must be given.")
-    r = _from_sun(q)
-    r2 = jnp.sum(r**2, axis=-1)
-    sine_squared = jnp.sum(r * pole[None, :], axis=-1) ** 2 / (r2 * jnp.sum(pole**2))
-    size = mu * args["J2"] * args.get("R", SUN_RADIUS) ** 2
-    return size / 2 * jnp.sum(masses[1:] * (3 * sine_squared - 1) / r2**1.5)
+    masses_of(q, args)
+    return _OBLATENESS.energy(0.0, 0.0, q, jnp.zeros_like(q), args)
 
 
 def hamiltonian_with_oblateness(t0, t1, q0, p1, args):
@@ -152,8 +143,16 @@ def _masses(q, args):
     return masses, args.get("G", 1.0) * masses[0]
 
 
-def _c2(args):
-    return args.get("c", SPEED_OF_LIGHT) ** 2
+def _c(args):
+    return args.get("c", SPEED_OF_LIGHT)
+
+
+_RELATIVITY = Relativity(_c)
+_OBLATENESS = Harmonics(
+    lambda args: args.get("R", SUN_RADIUS),
+    {2: lambda args: args["J2"]},
+    pole=lambda args: args.get("pole", SUN_POLE),
+)
 
 
 def _from_sun(x):
@@ -168,6 +167,6 @@ def _added_momenta(q, v, args):
     """The terms in 1/c² of the momenta: m_i w_i, and −Σ m_i w_i for the Sun."""
     masses, mu = _masses(q, args)
     u = _from_sun(v)
-    w = (_length(u) ** 2 / 2 + 3 * mu / _length(_from_sun(q))) / _c2(args) * u
+    w = (_length(u) ** 2 / 2 + 3 * mu / _length(_from_sun(q))) / _c(args) ** 2 * u
     corrections = masses[1:, None] * w
     return jnp.concatenate([-jnp.sum(corrections, axis=0, keepdims=True), corrections])
