@@ -16,7 +16,16 @@ from ..base.machine import results_memory
 from ..base.signature import output_of
 from ..lattices import Lattice, Run
 from ..methods import Method
-from ..observe import FORMS, Deviations, Range, Reduction, Running, Section, is_observable
+from ..observe import (
+    FORMS,
+    ConstraintForce,
+    Deviations,
+    Range,
+    Reduction,
+    Running,
+    Section,
+    is_observable,
+)
 from ..observe.solution import Save
 from ..problem.noise import Brownian, BrownianPath, NoisePath
 from .adjoints import Direct
@@ -45,7 +54,7 @@ def check_observe(task: Task, q0: Array, p0: Array) -> tuple[int, int]:
         if isinstance(leaf, Deviations):
             _check_deviations(leaf, task, q0)
             continue
-        function = leaf.function if isinstance(leaf, Reduction) else leaf
+        function = _function_of(leaf)
         name = getattr(function, "__name__", type(function).__name__)
         check_function(f"the argument of {type(leaf).__name__}", function, FORMS)
         t0, bound = task.t0, task.bound(function)
@@ -103,6 +112,9 @@ def noise_path(
         f"arithmetic={arithmetic!r:.200} cannot be used with noise: use dvi.FloatingPoint() or "
         "dvi.Compensated().": not isinstance(arithmetic, FloatingPoint | Compensated),
         f"h must be positive for a system with noise, got h={h}.": not is_traced(h) and not h > 0,
+        "dvi.ConstraintForce cannot be used with noise, because white noise is a part of it.": any(
+            isinstance(_function_of(observable), ConstraintForce) for observable in observables
+        ),
         # Between the ends of a step the path is not known.
         "dvi.Save(ts=...), dvi.Stop and dvi.Section cannot be used with noise, because they need "
         "states within a step: use dvi.Save(every=m) and a reduction such as dvi.Range.": (
@@ -119,6 +131,12 @@ def noise_path(
     # What a path of the user contains is what the user wants.
     limit = method.largest_increment if isinstance(path, Brownian) else None
     return NoisePath(path, method.increments, count, limit)
+
+
+def _function_of(observable: Any) -> Any:
+    """The function that an observable evaluates."""
+    observable = observable.reduction if isinstance(observable, Running) else observable
+    return observable.function if isinstance(observable, Reduction) else observable
 
 
 _COPIES = {False: 2.5, True: 4.5}

@@ -103,6 +103,10 @@ class Method(eqx.Module):
         """Whether it is a method for systems with a constraint, and for no others."""
         return False
 
+    def takes(self, has_constraint: bool) -> bool:
+        """Whether it is a method for systems with, or without, a constraint."""
+        return self.needs_constraint() == has_constraint
+
     def is_explicit(self, system: System, q: State | None = None, args: Args = None) -> bool:
         """Whether a step of this method on `system` needs no solve; read from the jaxpr.
 

@@ -47,6 +47,10 @@ class Noise(eqx.Module):
         """The change of p over a time h by `force` alone at constant q, exactly."""
         return h * self.force(t, q, p, args, dB / h)
 
+    def reaction(self, args: Args, like: State, h: Scalar) -> Any:
+        """The diagonal w of the change −w Gᵀμ by forces of constraint during `kick`."""
+        return 1
+
     def check_fixed_momentum(self, method: str, t: Scalar, q: State, p: State, args: Args) -> None:
         """**Raises** `ValueError` if a method cannot take the factor of dB at a known momentum."""
 
@@ -139,6 +143,13 @@ class Langevin(Noise):
         rate = -jnp.expm1(-2 * friction * h) / h
         noise = _amplitude(rate, temperature, mass) * dB.reshape(p.shape)
         return jnp.expm1(-friction * h) * p + noise
+
+    def reaction(self, args, like, h):
+        # The midpoint rule of the constrained equation with 2 tanh(γh/2) in place of γh: exact for
+        # an equal friction of all coordinates, and the canonical distribution is stationary for
+        # every friction (Lelièvre, Rousset & Stoltz 2012).
+        friction = self._values(args, like)[0]
+        return 1 + jnp.expm1(-friction * h) / 2 if friction.ndim else 1
 
 
 class NoiseHamiltonians(Noise):
