@@ -89,6 +89,7 @@ from .problem.lagrangian import (
 from .problem.noise import (
     Brownian as Brownian,
     BrownianPath as BrownianPath,
+    Ito as Ito,
     Langevin as Langevin,
     NoiseHamiltonians as NoiseHamiltonians,
 )

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Int
 
+import lanewise
 from lanewise.jaxprs.dependence import depends_on
 from lanewise.jaxprs.jaxapi import is_traced, threefry2x32
 
@@ -78,6 +79,43 @@ class MomentumNoise(Noise):
                 f"method=dvi.{method}() requires noise that does not depend on p. Use "
                 "method=dvi.StochasticMidpoint()."
             )
+
+
+class Ito(MomentumNoise):
+    r"""Momentum noise in the sense of Itô: dp = … + σ(t, q, p) dB, with σ dB and not σ ∘ dB.
+
+    The methods solve the equation of Stratonovich with the same solutions,
+
+        dp_i = (… − ½ Σ_jm σ_jm ∂σ_im/∂p_j) dt + Σ_m σ_im ∘ dB_m
+
+    (by autodiff; σ of the shape of q is a diagonal matrix). The correction is zero if σ does not
+    depend on p: q has no noise, so that a dependence on q makes no difference.
+
+    **Arguments** `sigma`: function ``(t, q, p, args)`` as for ``System(H_D, noise=sigma)``, of the
+    shape of q or (*q.shape, m) [unit of p/√time].
+
+    **Raises** `TypeError` for another function; `ValueError` in `integrate` for another shape, and
+    for a σ that depends on p with another method than `StochasticMidpoint`.
+
+    **Source** Kloeden & Platen 1992, *Numerical Solution of Stochastic Differential Equations*,
+    4.9.
+    """
+
+    def __init__(self, sigma: Callable[..., Any]):
+        self.sigma = with_time("sigma of dvi.Ito", sigma)
+        warn_of_exchanged("sigma of dvi.Ito", self.sigma, _NAMES)
+
+    def force(self, t, q, p, args, rates):
+        def change(unit):
+            """Σ_j σ_jm ∂σ_m/∂p_j of the motion with this unit vector."""
+
+            def column(p):
+                return MomentumNoise.force(self, t, q, p, args, unit)
+
+            return jax.jvp(column, (p,), (column(p),))[1]
+
+        changes = jax.vmap(change)(lanewise.unit_vectors(rates.size, p.dtype))
+        return super().force(t, q, p, args, rates) - jnp.sum(changes, axis=0) / 2
 
 
 class Langevin(Noise):
