@@ -49,6 +49,7 @@ from .methods import (
     StochasticEuler as StochasticEuler,
     StochasticMidpoint as StochasticMidpoint,
     Strang as Strang,
+    StrongSplitting as StrongSplitting,
     Suzuki as Suzuki,
     TypeII as TypeII,
     WisdomHolman as WisdomHolman,

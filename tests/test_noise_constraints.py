@@ -226,9 +226,8 @@ STEPS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", ["unequal friction", *(pytest.param(x, marks=slow) for x in list(STEPS)[:-1])]
-)
+@slow
+@pytest.mark.parametrize("name", STEPS)
 def test_a_step_back_along_the_path_undoes_a_step(name):
     H_D, method, friction = STEPS[name]
     system = dvi.System(H_D, noise=dvi.Langevin(friction, T), constraint=unit_sphere)

@@ -16,7 +16,7 @@ from ..integration.integrate import integrate
 from ..integration.keywords import IntegrationSettings
 from ..observe import Mean
 from ..observe.solution import Save
-from ..problem.noise import Brownian
+from ..problem.paths import Brownian
 from ..problem.system import System, check_system, of_problem
 
 

@@ -27,7 +27,7 @@ from ..observe import (
     is_observable,
 )
 from ..observe.solution import Save
-from ..problem.noise import Brownian, BrownianPath, NoisePath
+from ..problem.paths import Brownian, BrownianPath, NoisePath
 from .adjoints import Direct
 from .arithmetic import Compensated, FloatingPoint
 from .integrator import Integrator
@@ -112,6 +112,10 @@ def noise_path(
         f"arithmetic={arithmetic!r:.200} cannot be used with noise: use dvi.FloatingPoint() or "
         "dvi.Compensated().": not isinstance(arithmetic, FloatingPoint | Compensated),
         f"h must be positive for a system with noise, got h={h}.": not is_traced(h) and not h > 0,
+        f"path={path!r:.200} must have areas for method={method!r:.200}: use dvi.Brownian(key), or "
+        "implement the method areas of dvi.BrownianPath.": (
+            method.needs_areas and type(path).areas is BrownianPath.areas
+        ),
         "dvi.ConstraintForce cannot be used with noise, because white noise is a part of it.": any(
             isinstance(_function_of(observable), ConstraintForce) for observable in observables
         ),
@@ -130,7 +134,7 @@ def noise_path(
     count = noise.count(run.t0, run.q0, run.p0, run.args)
     # What a path of the user contains is what the user wants.
     limit = method.largest_increment if isinstance(path, Brownian) else None
-    return NoisePath(path, method.increments, count, limit)
+    return NoisePath(path, method.increments, count, limit, method.needs_areas)
 
 
 def _function_of(observable: Any) -> Any:

@@ -22,7 +22,7 @@ from ..methods.step import Equations
 from ..observe import Deviations, Reduction, Running, Stop, is_observable
 from ..observe._reductions import no_value
 from ..observe.solution import Save
-from ..problem.noise import NoisePath
+from ..problem.paths import NoisePath
 from .arithmetic import Arithmetic, FloatingPoint
 
 

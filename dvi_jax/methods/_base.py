@@ -35,6 +35,9 @@ class Method(eqx.Module):
     increments: ClassVar[int] = 0
     """Increments of noise that a step takes; 0: no method for systems with noise."""
 
+    needs_areas: ClassVar[bool] = False
+    """Whether a step takes the areas of the increments as well, see `BrownianPath`."""
+
     largest_increment: ClassVar[float | None] = None
     """Limit of the increments of `Brownian`, in standard deviations; None: no limit."""
 
