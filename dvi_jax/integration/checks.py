@@ -114,15 +114,17 @@ def noise_path(
         f"h must be positive for a system with noise, got h={h}.": not is_traced(h) and not h > 0,
         f"path={path!r:.200} must have areas for method={method!r:.200}: use dvi.Brownian(key), or "
         "implement the method areas of dvi.BrownianPath.": (
-            method.needs_areas and type(path).areas is BrownianPath.areas
+            method.needs_areas and getattr(type(path), "areas", None) is BrownianPath.areas
         ),
         "dvi.ConstraintForce cannot be used with noise, because white noise is a part of it.": any(
             isinstance(_function_of(observable), ConstraintForce) for observable in observables
         ),
-        # Between the ends of a step the path is not known.
-        "dvi.Save(ts=...), dvi.Stop and dvi.Section cannot be used with noise, because they need "
-        "states within a step: use dvi.Save(every=m) and a reduction such as dvi.Range.": (
-            run.save.ts is not None or run.stop is not None or has_section
+        # Between the ends of a step only some paths are known.
+        f"path={path!r:.200} cannot be used with dvi.Save(ts=...), dvi.Stop and dvi.Section, which "
+        "need states within a step: use dvi.Brownian(key), or implement the method part of "
+        "dvi.BrownianPath.": (
+            (run.save.ts is not None or run.stop is not None or has_section)
+            and getattr(type(path), "part", None) is BrownianPath.part
         ),
     }
     messages = [message for message, applies in conditions.items() if applies]

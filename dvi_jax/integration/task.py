@@ -187,7 +187,7 @@ class Carry(NamedTuple):
     residual: Float[Array, "2"]
     reductions: list[Any]
     remainder: Any = None  # what the arithmetic stores next to q and p
-    stop: Any = None  # with a `Stop`: the last step, as a row
+    stop: Any = None  # with a `Stop`: the last step, as a row, and its number
     method_state: Any = None  # of a method with an `InLoop`: the state in its own coordinates
 
 

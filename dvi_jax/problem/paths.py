@@ -15,7 +15,7 @@ from jaxtyping import Array, Int
 from lanewise.jaxprs.jaxapi import is_traced, threefry2x32
 
 from ..base.checks import array, whole
-from ..base.types import Interval
+from ..base.types import Interval, Scalar
 
 
 class BrownianPath(eqx.Module):
@@ -30,6 +30,12 @@ class BrownianPath(eqx.Module):
     def areas(self, k: Int[Array, ""], interval: Interval, parts: int, count: int) -> Array | None:
         """(1/l) ∫ (B(s) − ΔB s/l) ds, 0 ≤ s ≤ l, of each part of the length l, with B(0) = 0: the
         mean distance of the path from its chord. As `increments`; None: not available."""
+
+    def part(
+        self, k: Int[Array, ""], interval: Interval, fraction: Scalar, parts: int, count: int
+    ) -> tuple[Array, Array] | None:
+        """The increments and areas over the equal parts of the first `fraction` of step k, for
+        states within the step; consistent with those of the step. None: not available."""
 
     def check(self, num_steps: int) -> None:
         """**Raises** `ValueError` for a run of more steps than the path has."""
@@ -91,19 +97,51 @@ class Brownian(BrownianPath):
 
         def term(i, number):
             # The mean distance from the chord of a path of `size` pieces, and those of the pieces.
-            z, y = jnp.split(_normal(self.key, number, 2 * count, interval.h.dtype), 2)
-            return (size - 1 - 2 * i) / (2 * size) * z + y / (math.sqrt(12) * size)
+            z, area = _pair(self.key, number, count, interval.h.dtype)
+            return (size - 1 - 2 * i) / (2 * size) * z + area / size
 
         return self._sums(k, interval, jnp.zeros((parts, count), interval.h.dtype), term)
 
-    def _sums(self, k, interval, zero, term):
-        """√(h/n) Σ_i ``term(i, number)`` over the n substeps of each part."""
+    def part(self, k, interval, fraction, parts, count):
+        cells, dtype = parts * self.substeps, interval.h.dtype
+        first, zero = self._first_number(k, cells), jnp.zeros(count, dtype)
+        # Not differentiated: for derivatives the normals of this part are constants, as are those
+        # of a step, and its increments scale with the root of its length.
+        size = lax.stop_gradient(jnp.maximum(fraction, jnp.finfo(dtype).tiny)) * cells
+
+        def at(x):
+            """B and ∫ B dx after x substeps, with x as the time."""
+            last = jnp.minimum(jnp.floor(x), cells - 1).astype(jnp.int32)
+
+            def add(i, sums):
+                z, area = _pair(self.key, first + jnp.uint32(i), count, dtype)
+                new = sums[0] + z, sums[1] + sums[0] + z / 2 + area
+                return jax.tree.map(lambda a, b: jnp.where(i < last, a, b), new, sums)
+
+            B, integral = lax.fori_loop(0, cells, add, (zero, zero))
+            x = x - last
+            b, inner = _inside(self.key, first + last.astype(jnp.uint32), x, count, dtype)
+            return B + b, integral + B * x + inner
+
+        points = [(zero, zero), *(at(size * (i + 1) / parts) for i in range(parts))]
+        B, integral = (jnp.stack(column) for column in zip(*points, strict=True))
+        increments = jnp.diff(B, axis=0)
+        areas = jnp.diff(integral, axis=0) * (parts / size) - B[:-1] - increments / 2
+        scale = jnp.sqrt(fraction * interval.h / size)
+        return scale * increments, scale * areas
+
+    def _first_number(self, k, cells):
         # Modulo 2³², as the numbers of `fold_in` are; `check` excludes that they repeat.
         step = jnp.asarray(self.first_step).astype(jnp.uint32) + k.astype(jnp.uint32)
+        return step * cells
+
+    def _sums(self, k, interval, zero, term):
+        """√(h/n) Σ_i ``term(i, number)`` over the n substeps of each part."""
         parts, size = len(zero), self.substeps
+        first = self._first_number(k, parts * size)
 
         def add(i, sums):
-            numbers = [(step * parts + part) * size + jnp.uint32(i) for part in range(parts)]
+            numbers = [first + jnp.uint32(part * size) + jnp.uint32(i) for part in range(parts)]
             return sums + jnp.stack([term(i, number) for number in numbers])
 
         # A loop, so that the code does not grow with the number of substeps.
@@ -126,6 +164,14 @@ class NoisePath(eqx.Module):
         rows = [self._rows("increments", k, interval)]
         rows += [self._rows("areas", k, interval)] if self.has_areas else []
         return self._limited(jnp.concatenate(rows), interval)
+
+    def increments_within(self, k: Int[Array, ""], interval: Interval, fraction: Scalar) -> Array:
+        """The same over the first `fraction` of step k; those of the step to the bit at its end."""
+        rows = self.path.part(k, interval, fraction, self.parts, self.count)
+        assert rows is not None  # checked before the run
+        rows = jnp.concatenate(rows[: 1 + self.has_areas]).astype(interval.h.dtype)
+        rows = self._limited(rows, interval._replace(h=fraction * interval.h))
+        return jnp.where(fraction == 1, self.increments_of(k, interval), rows)
 
     def _rows(self, name: str, k: Int[Array, ""], interval: Interval) -> Array:
         rows = getattr(self.path, name)(k, interval, self.parts, self.count)
@@ -169,12 +215,51 @@ def _words(key: Any) -> Array:
     )
 
 
-def _normal(key: Array, number: Array, count: int, dtype: Any) -> Array:
-    """``jax.random.normal(jax.random.fold_in(key, number), (count,), dtype)`` to round-off."""
+_HALVINGS = 24
+"""Of a substep, for a point in it: between the last ones the path is a straight line."""
+
+
+def _inside(key: Array, number: Array, x: Scalar, count: int, dtype: Any) -> tuple[Array, Array]:
+    """B and ∫ B dx at 0 ≤ x ≤ 1 of the path with unit step and this number."""
+
+    # The increment w and the area c of an interval give those of its halves with two normals more
+    # (Foster, Oberhauser & Lyons 2020): a point has one value, in every order of the requests.
+    def halve(_, state):
+        node, length, x, B, integral, w, c = state
+        z, area = _pair(key, number, count, dtype, node)
+        turn, spread = 1.5 * c + jnp.sqrt(length) / 4 * z, jnp.sqrt(length) / 2 * area
+        mean = c / 4 - jnp.sqrt(length) / 8 * z
+        is_right = x >= 0.5
+        w1, c1 = w / 2 + turn, mean + spread
+        return (
+            2 * node + is_right.astype(jnp.uint32),
+            length / 2,
+            jnp.where(is_right, 2 * x - 1, 2 * x),
+            jnp.where(is_right, B + w1, B),
+            jnp.where(is_right, integral + length / 2 * (B + w1 / 2 + c1), integral),
+            jnp.where(is_right, w / 2 - turn, w1),
+            jnp.where(is_right, mean - spread, c1),
+        )
+
+    zero, one = jnp.zeros(count, dtype), jnp.ones((), dtype)
+    start = jnp.uint32(1), one, x, zero, zero, *_pair(key, number, count, dtype)
+    _, length, x, B, integral, w, _ = lax.fori_loop(0, _HALVINGS, halve, start)
+    return B + x * w, integral + length * x * (B + x * w / 2)
+
+
+def _pair(key: Array, number: Array, count: int, dtype: Any, node: Any = 0) -> tuple[Array, Array]:
+    """Increment and area over a unit time: normals with the variances 1 and 1/12."""
+    z, y = jnp.split(_normal(key, number, 2 * count, dtype, node), 2)
+    return z, y / math.sqrt(12)
+
+
+def _normal(key: Array, number: Array, count: int, dtype: Any, node: Any = 0) -> Array:
+    """``jax.random.normal(jax.random.fold_in(key, number), (count,), dtype)`` to round-off; other
+    numbers for each other `node`."""
     # What `fold_in` does: the words of the number, encrypted with the key, are a new key.
     step_key = jnp.stack(threefry2x32(key, jnp.uint32(0), number))
     # What `random_bits` does: the index of each number in two words.
-    words = threefry2x32(step_key, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
+    words = threefry2x32(step_key, jnp.uint32(node), jnp.arange(count, dtype=jnp.uint32))
     info, bits = jnp.finfo(dtype), words[0] ^ words[1]
     if info.bits == 64:
         bits = words[0].astype(jnp.uint64) << 32 | words[1].astype(jnp.uint64)
