@@ -51,6 +51,7 @@ from .methods import (
     StochasticEuler as StochasticEuler,
     StochasticMidpoint as StochasticMidpoint,
     Strang as Strang,
+    StrongSplitting as StrongSplitting,
     Suzuki as Suzuki,
     TypeII as TypeII,
     WisdomHolman as WisdomHolman,
@@ -93,6 +94,7 @@ from .problem.lagrangian import (
 from .problem.noise import (
     Brownian as Brownian,
     BrownianPath as BrownianPath,
+    Ito as Ito,
     Langevin as Langevin,
     NoiseHamiltonians as NoiseHamiltonians,
 )

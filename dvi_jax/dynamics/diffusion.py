@@ -16,7 +16,7 @@ from ..integration.integrate import integrate
 from ..integration.keywords import IntegrationSettings
 from ..observe import Mean
 from ..observe.solution import Save
-from ..problem.noise import Brownian
+from ..problem.paths import Brownian
 from ..problem.system import System, check_system, of_problem
 
 
@@ -71,13 +71,14 @@ def invariant_diffusion(
     **Accuracy** τ must be long compared with the periods of the orbit, and so short that I changes
     little. The errors are those of the number of paths alone.
 
-    **Raises** `ValueError` for a system without noise; errors of `integrate` if a path fails.
+    **Raises** `ValueError` for a system without noise or with a constraint; errors of `integrate`
+    if a path fails.
 
     **Source** averaging: Khasminskii 1968, *Kybernetika* 4, 260; Freidlin & Wentzell 2012, *Random
     Perturbations of Dynamical Systems*, 8.
     """
     system, q0, p0, h, args = of_problem(system, q0, p0, settings.get("h"), settings.get("args"))
-    check_system(system, noise_allowed=True)
+    check_system(system, "invariant_diffusion", noise_allowed=True)
     whole("num_paths", num_paths, 2)
     noise = system.noise
     if noise is None:

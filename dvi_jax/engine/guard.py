@@ -138,6 +138,25 @@ def _nan_if_used(values: Any, inputs: Any) -> Any:
     return same(values, inputs)
 
 
+def without_derivative(values: Any) -> Any:
+    """The floating-point `values`; a loss that depends on them has the gradient NaN, and a change
+    of them in forward mode is NaN."""
+
+    def nan_unless_zero(_, changes):
+        return jax.tree.map(lambda c: jnp.where(c == 0, c, jnp.nan), changes)
+
+    def define(_, changes):
+        return changes
+
+    same = jax.custom_jvp(lambda values: values)
+
+    @same.defjvp
+    def _(primals, tangents):
+        return primals[0], linear_map(nan_unless_zero, nan_unless_zero, define, (), tangents[0])
+
+    return same(values)
+
+
 def _any_of(condition: Callable, *trees: Any) -> Array:
     """Whether the condition is true of a number in the arrays of these trees."""
     parts = jax.tree.map(lambda *xs: jnp.any(condition(*xs)), *trees)

@@ -19,6 +19,7 @@ from ..lattices import Lattice, Run
 from ..methods import Method
 from ..observe import (
     FORMS,
+    ConstraintForce,
     Deviations,
     Range,
     Reduction,
@@ -29,7 +30,7 @@ from ..observe import (
 )
 from ..observe._kept import KeptSteps
 from ..observe.solution import Save
-from ..problem.noise import Brownian, BrownianPath, NoisePath
+from ..problem.paths import Brownian, BrownianPath, NoisePath
 from .adjoints import Direct
 from .arithmetic import Compensated, FloatingPoint
 from .integrator import Integrator
@@ -56,7 +57,7 @@ def check_observe(task: Task, q0: Array, p0: Array) -> tuple[int, int]:
         if isinstance(leaf, Deviations):
             _check_deviations(leaf, task, q0)
             continue
-        function = leaf.function if isinstance(leaf, Reduction) else leaf
+        function = _function_of(leaf)
         name = getattr(function, "__name__", type(function).__name__)
         check_function(f"the argument of {type(leaf).__name__}", function, FORMS)
         t0, bound = task.t0, task.bound(function)
@@ -174,10 +175,19 @@ def noise_path(
         f"arithmetic={arithmetic!r:.200} cannot be used with noise: use dvi.FloatingPoint() or "
         "dvi.Compensated().": not isinstance(arithmetic, FloatingPoint | Compensated),
         f"h must be positive for a system with noise, got h={h}.": not is_traced(h) and not h > 0,
-        # Between the ends of a step the path is not known.
-        "dvi.Save(ts=...), dvi.Stop and dvi.Section cannot be used with noise, because they need "
-        "states within a step: use dvi.Save(every=m) and a reduction such as dvi.Range.": (
-            run.save.ts is not None or run.stop is not None or has_section
+        f"path={path!r:.200} must have areas for method={method!r:.200}: use dvi.Brownian(key), or "
+        "implement the method areas of dvi.BrownianPath.": (
+            method.needs_areas and getattr(type(path), "areas", None) is BrownianPath.areas
+        ),
+        "dvi.ConstraintForce cannot be used with noise, because white noise is a part of it.": any(
+            isinstance(_function_of(observable), ConstraintForce) for observable in observables
+        ),
+        # Between the ends of a step only some paths are known.
+        f"path={path!r:.200} cannot be used with dvi.Save(ts=...), dvi.Stop and dvi.Section, which "
+        "need states within a step: use dvi.Brownian(key), or implement the method part of "
+        "dvi.BrownianPath.": (
+            (run.save.ts is not None or run.stop is not None or has_section)
+            and getattr(type(path), "part", None) is BrownianPath.part
         ),
     }
     refuse_first(conditions)
@@ -187,7 +197,13 @@ def noise_path(
     count = noise.count(run.t0, run.q0, run.p0, run.args)
     # What a path of the user contains is what the user wants.
     limit = method.largest_increment if isinstance(path, Brownian) else None
-    return NoisePath(path, method.increments, count, limit)
+    return NoisePath(path, method.increments, count, limit, method.needs_areas)
+
+
+def _function_of(observable: Any) -> Any:
+    """The function that an observable evaluates."""
+    observable = observable.reduction if isinstance(observable, Running) else observable
+    return observable.function if isinstance(observable, Reduction) else observable
 
 
 _COPIES = {False: 2.5, True: 4.5}

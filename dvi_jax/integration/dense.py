@@ -22,6 +22,7 @@ from ..methods.step import Equations, info_of
 from ..observe import Crossings, Reduction, Section, Stop, Stopped, is_observable
 from ..observe._kept import RequestedTimes, StepStart, event, from_rows, shown
 from ..observe.solution import Save
+from ..problem.paths import NoisePath
 from .task import Task
 
 Point = tuple[Scalar, State, State]
@@ -38,18 +39,24 @@ class Curve(eqx.Module):
     # end is the end of the step.
     method: Method
     equations: Equations
+    path: NoisePath | None
     layout: Layout = eqx.field(static=True)
 
     @classmethod
-    def create(cls, method: Method, equations: Equations, layout: Layout) -> "Curve":
+    def of_task(cls, task: Task, layout: Layout) -> "Curve":
         # In fixed point the curve would be a staircase, on which no root can be found.
-        return cls(method, dataclasses.replace(equations, quantum=None), layout)
+        equations = dataclasses.replace(task.equations, quantum=None)
+        return cls(task.method, equations, task.path, layout)
 
     def point(self, start: StepStart, theta: Scalar) -> PointAndStatus:
         """(t, q, p) at the fraction θ of the step."""
         h = theta * (start.t1 - start.t0)
-        t = start.t0 + h
-        q, p, info = self.method.step(self.equations, Interval(start.t0, t, h), start.q0, start.p0)
+        t, equations = start.t0 + h, self.equations
+        if self.path is not None:
+            step = Interval(start.t0, start.t1, start.t1 - start.t0)
+            increments = self.path.increments_within(start.k, step, theta)
+            equations = dataclasses.replace(equations, increments=increments)
+        q, p, info = self.method.step(equations, Interval(start.t0, t, h), start.q0, start.p0)
         return (t, q, p), info_of(self.method, info, q, p).result
 
     def where(self, g: Callable[..., Any], start: StepStart, exists: Array) -> PointAndStatus:
@@ -95,12 +102,12 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
 
 
 def crossings(
-    curve: Curve, section: Section, record: tuple[Array, Array], safe: StepStart
+    curve: Curve, section: Section, record: tuple[Array, Array, Array], safe: StepStart
 ) -> tuple[Crossings, RESULTS]:
     """The crossings in the steps that a section has recorded, and their status. `safe` is any step
     that exists."""
-    rows, count = record
-    exists, starts = _steps(rows, safe)
+    rows, count, steps = record
+    exists, starts = _steps(rows, steps, safe)
     point_of = guarded(_crossing, (curve, section.g), curve.layout, has_succeeded)
     points, statuses = jax.vmap(point_of)(exists, starts, exists)
     ts, qs, ps = _or_nan(exists, points)
@@ -115,11 +122,11 @@ def _crossing(surface: tuple[Curve, Callable], start: StepStart, exists: Array) 
 
 
 def at_times(
-    curve: Curve, request: RequestedTimes, record: tuple[Array, Array], safe: StepStart
+    curve: Curve, request: RequestedTimes, record: tuple[Array, Array, Array], safe: StepStart
 ) -> tuple[Array, StepStart, Point, RESULTS]:
     """For each requested time: is it reached, the step that contains it, and the point there; and
     the status of these points."""
-    exists, starts = _steps(record[0], safe)
+    exists, starts = _steps(record[0], record[2], safe)
     clock = (curve, request.clock)
     readings = each(_reading, clock, starts, layout=curve.layout)
     first = one_by_one(_reading, clock, safe, layout=curve.layout)
@@ -188,10 +195,12 @@ def _just_after(time: Scalar, start: StepStart) -> Scalar:
     return time + lax.stop_gradient(part * (start.t1 - start.t0))
 
 
-def stop_point(curve: Curve, stop: Stop, row: Array, safe: StepStart) -> tuple[Stopped, RESULTS]:
+def stop_point(
+    curve: Curve, stop: Stop, record: tuple[Array, Array], safe: StepStart
+) -> tuple[Stopped, RESULTS]:
     """The point g = 0 in the last step of a run, the start of that step if g ≥ 0 there already; and
     its status."""
-    exists, start = _steps(row, safe)
+    exists, start = _steps(*record, safe)
     origin = (start.t0, start.q0, start.p0)
     value = one_by_one(event, stop.g, *origin, curve.equations.args, layout=curve.layout)
     is_start = value >= 0
@@ -229,9 +238,9 @@ def _with_slope(curve: Array, value: Array) -> Array:
     return jnp.where(jnp.isnan(curve), value, curve + lax.stop_gradient(value - curve))
 
 
-def _steps(rows: Array, safe: StepStart) -> tuple[Array, StepStart]:
-    """The steps in the rows, and the safe one for an empty row."""
-    exists, starts = from_rows(rows, safe.q0.shape)
+def _steps(rows: Array, k: Array, safe: StepStart) -> tuple[Array, StepStart]:
+    """The steps in the rows, of the numbers k, and the safe one for an empty row."""
+    exists, starts = from_rows(rows, k, safe.q0.shape)
 
     def fill(x, substitute):
         return jnp.where(_flags_like(exists, x), x, substitute)

@@ -23,7 +23,7 @@ from ..lattices import Lattice, Run
 from ..methods import Method
 from ..observe import Jump, OfState, Stop, is_observable, of_steps, refuse_slow_time
 from ..observe.solution import Save, Solution
-from ..problem.noise import as_path
+from ..problem.paths import as_path
 from ..problem.system import System, check_system, of_problem
 from .adjoints import AbstractAdjoint
 from .arithmetic import Arithmetic
@@ -107,7 +107,8 @@ def integrate(
     - `integrator`: an `Integrator` in place of method, lattice, adjoint, newton, arithmetic and
       layout.
     - `path`: of a system with noise: a `Brownian` path, or an integer, the seed of one. The method
-      is one for noise: `BAOAB`, `OBABO`, `StochasticEuler`, `StochasticMidpoint`.
+      is one for noise: `BAOAB`, `OBABO`, `StrongSplitting`, `StochasticEuler`,
+      `StochasticMidpoint`.
     - `throw`: raise an error if the trajectory fails; otherwise read ``solution.result``.
     - `progress`: True shows a progress bar. A function is called as
       ``progress(steps_done, num_steps)`` at save points, at most about a hundred times during the

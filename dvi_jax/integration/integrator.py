@@ -76,18 +76,10 @@ class Integrator(eqx.Module):
         method = default_method(system) if self.method is None else self.method
         has_constraint = system.constraint is not None
         # By the class, as in `steps_of`: a bound method of a module takes 20 µs to make.
-        needs_constraint = type(method).needs_constraint(method)
-        takes_both = needs_constraint and method.increments
-        if has_constraint and system.noise is not None and not takes_both:
+        if not type(method).takes(method, has_constraint):
             raise ValueError(
-                "a system cannot have noise and a constraint together: no method takes both. Use "
-                "coordinates without a constraint, such as the angle of a pendulum, or leave out "
-                "noise or constraint in dvi.System."
-            )
-        if needs_constraint != has_constraint:
-            raise ValueError(
-                "a system with a constraint needs method=dvi.Rattle() or a composition of it, got "
-                f"{method!r}."
+                "a system with a constraint needs method=dvi.Rattle() or a composition of it, with "
+                f"noise dvi.BAOAB() or dvi.OBABO(), got {method!r}."
                 if has_constraint
                 else f"method={method!r} needs a constraint: give dvi.System(H_D, constraint=g), "
                 "or another method."

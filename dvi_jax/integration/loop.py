@@ -65,7 +65,8 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         result = RESULTS.where(~is_failure & jnp.isnan(value), RESULTS.event_not_finite, result)
         is_failure = is_failure | jnp.isnan(value)
         result = RESULTS.where(is_end, RESULTS.stopped, result)
-        stop = as_row(is_end, StepStart(task.t0, interval.t1, interval.t1, q0, p0))
+        row = as_row(is_end, StepStart(task.t0, interval.t1, interval.t1, q0, p0))
+        stop = row, jnp.asarray(0, jnp.int32)
     good = result == RESULTS.successful
     # A typed zero: the carry of a scan must not change its type, and a Python integer would.
     zero = jnp.asarray(0, jnp.int32)
@@ -301,7 +302,7 @@ def _deviations(push: Callable, vectors: Array, ends: Ends, h: Scalar) -> Pushed
 
 
 def _stop(task: Task, carry: Carry, last: Ends, result: RESULTS) -> tuple[RESULTS, Any]:
-    """The status and the stored row, after a step that may meet the condition of a `Stop`."""
+    """The status, the stored row and its number, after a step that may meet the condition."""
     if task.stop is None:
         return result, None
     value = event(task.stop.g, last.t1, last.q1, last.p1, task.args)
@@ -309,7 +310,8 @@ def _stop(task: Task, carry: Carry, last: Ends, result: RESULTS) -> tuple[RESULT
     is_end = good & (value >= 0)
     row = as_row(is_end, StepStart(last.t0, last.t1, last.t1, last.q0, last.p0))
     result = RESULTS.where(good & jnp.isnan(value), RESULTS.event_not_finite, result)
-    return RESULTS.where(is_end, RESULTS.stopped, result), jnp.where(is_end, row, carry.stop)
+    stop = jnp.where(is_end, row, carry.stop[0]), jnp.where(is_end, carry.k, carry.stop[1])
+    return RESULTS.where(is_end, RESULTS.stopped, result), stop
 
 
 def run(

@@ -15,10 +15,10 @@ from lanewise.jaxprs.jaxapi import is_traced, manual_axes
 
 from ..base.reads import Reads
 from ..base.results import RESULTS, IntegrationError, status_code, status_name, with_auxiliary
-from ..engine.guard import all_finite, nan_where_used
+from ..engine.guard import all_finite, nan_where_used, without_derivative
 from ..engine.newton import relative_size
 from ..lattices import Place, Run
-from ..observe import OfState, Reduction, RequestedTimes, Running, Section, is_observable
+from ..observe import Crossings, OfState, Reduction, RequestedTimes, Running, Section, is_observable
 from ..observe._kept import StepStart
 from ..observe.solution import Solution
 from .dense import Curve, at_times, crossings, guarded, stop_point
@@ -31,21 +31,25 @@ def as_solution(
 ) -> Solution:
     """The public `Solution` of a run."""
     carry, rows, values, defect = outcome
-    curve = Curve.create(task.method, task.equations, layout)
+    curve = Curve.of_task(task, layout)
     first = task.first_interval()
     # A batch element without a step to interpolate in uses the first one.
-    safe = StepStart(first.t0, first.t1, first.t1, q0, p0)
+    safe = StepStart(first.t0, first.t1, first.t1, q0, p0, jnp.asarray(0, jnp.int32))
     _, reductions = task.observables()
     status, results = carry.result, list(values)
     for i, reduction in enumerate(reductions):
         if isinstance(reduction, Section):
-            results[i], of_points = crossings(curve, reduction, values[i], safe)
+            listed, of_points = crossings(curve, reduction, values[i], safe)
+            ts, qs, ps = _of_path(task, (listed.ts, listed.qs, listed.ps))
+            results[i] = Crossings(ts, qs, ps, listed.count)
             status = with_auxiliary(status, of_points)
     if reductions and isinstance(request := reductions[0], RequestedTimes):
         is_reached, starts, (ts, qs, ps), of_points = at_times(curve, request, results[0], safe)
         status = with_auxiliary(status, of_points)
         if request.clock is None:
             ts = request.ts  # also the times that were not reached
+        else:
+            ts, qs, ps = _of_path(task, (ts, qs, ps))
         is_short = (status == RESULTS.successful) & ~jnp.all(is_reached)
         status = RESULTS.where(is_short, RESULTS.not_reached, status)
         results, hs = results[1:], ts - starts.t0
@@ -69,12 +73,18 @@ def as_solution(
     observed = observed_values(observe, columns, results)
     end = None
     if task.stop is not None:
-        equations = task.with_args(carry).equations
-        curve = Curve.create(task.method, equations, layout)
+        curve = Curve.of_task(task.with_args(carry), layout)
         end, of_point = stop_point(curve, task.stop, carry.stop, safe)
+        end = _of_path(task, end)
         status = with_auxiliary(status, of_point)
     jumps = jumps_of(carry.jumps, q0) if task.jumps else None
     return Solution(ts, qs, ps, hs, observed, status, stats, end, jumps)
+
+
+def _of_path(task: Task, points: Any) -> Any:
+    """Points at times that depend on the state."""
+    # The time at which a Brownian path has a value is no differentiable function of parameters.
+    return points if task.path is None else without_derivative(points)
 
 
 def _values(observables: tuple[list[Any], Any], ends: Ends) -> list[PyTree]:

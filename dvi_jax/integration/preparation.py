@@ -22,7 +22,7 @@ from ..methods.constraint import check_start
 from ..methods.step import Equations
 from ..observe import Deviations, Running, is_observable
 from ..observe.solution import Solution
-from ..problem.noise import BrownianPath
+from ..problem.paths import BrownianPath
 from ..problem.system import System
 from .adjoints import AbstractAdjoint
 from .checks import check_jumps, check_memory, check_observe, noise_path

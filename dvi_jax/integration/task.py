@@ -23,7 +23,7 @@ from ..observe import Deviations, Jump, Reduction, Running, Stop, is_observable
 from ..observe._kept import KeptSteps
 from ..observe._reductions import no_value
 from ..observe.solution import Save
-from ..problem.noise import NoisePath
+from ..problem.paths import NoisePath
 from .arithmetic import Arithmetic, FloatingPoint
 
 
@@ -204,7 +204,7 @@ class Carry(NamedTuple):
     residual: Float[Array, "2"]
     reductions: list[Any]
     remainder: Any = None  # what the arithmetic stores next to q and p
-    stop: Any = None  # with a `Stop`: the last step, as a row
+    stop: Any = None  # with a `Stop`: the last step, as a row, and its number
     method_state: Any = None  # of a method with an `InLoop`: the state in its own coordinates
     jumps: Any = None  # with a `Jump`: a `JumpMemory`
     args: Args = None  # where a jump changes them

@@ -23,6 +23,7 @@ from ._stochastic import (
     OBABO as OBABO,
     StochasticEuler as StochasticEuler,
     StochasticMidpoint as StochasticMidpoint,
+    StrongSplitting as StrongSplitting,
 )
 from ._strang import Strang as Strang
 from ._type_ii import TypeII as TypeII

@@ -35,6 +35,9 @@ class Method(eqx.Module):
     increments: ClassVar[int] = 0
     """Increments of noise that a step takes; 0: no method for systems with noise."""
 
+    needs_areas: ClassVar[bool] = False
+    """Whether a step takes the areas of the increments as well, see `BrownianPath`."""
+
     largest_increment: ClassVar[float | None] = None
     """Limit of the increments of `Brownian`, in standard deviations; None: no limit."""
 
@@ -102,6 +105,10 @@ class Method(eqx.Module):
     def needs_constraint(self) -> bool:
         """Whether it is a method for systems with a constraint, and for no others."""
         return False
+
+    def takes(self, has_constraint: bool) -> bool:
+        """Whether it is a method for systems with, or without, a constraint."""
+        return type(self).needs_constraint(self) == has_constraint
 
     def is_explicit(self, system: System, q: State | None = None, args: Args = None) -> bool:
         """Whether a step of this method on `system` needs no solve; read from the jaxpr.

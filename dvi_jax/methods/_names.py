@@ -12,7 +12,7 @@ from ._published import BlanesMoan, KahanLi, McLachlan, Suzuki, Yoshida
 from ._rattle import Rattle
 from ._runge_kutta4 import RungeKutta4
 from ._splitting import Splitting
-from ._stochastic import BAOAB, OBABO, StochasticEuler, StochasticMidpoint
+from ._stochastic import BAOAB, OBABO, StochasticEuler, StochasticMidpoint, StrongSplitting
 from ._strang import Strang
 from ._type_ii import TypeII
 from ._wisdom_holman import WisdomHolman
@@ -36,7 +36,8 @@ def as_method(method: Any) -> Any:
         "Splitting": Splitting,
         "WisdomHolman": WisdomHolman,
         **dict.fromkeys(("RungeKutta4", "RK4"), RungeKutta4),
-        **{kind.__name__: kind for kind in (BAOAB, OBABO, StochasticEuler, StochasticMidpoint)},
+        **{kind.__name__: kind for kind in (BAOAB, OBABO, StrongSplitting)},
+        **{kind.__name__: kind for kind in (StochasticEuler, StochasticMidpoint)},
         "ImplicitMidpoint": lambda: GaussLegendre(1),
     }
     kinds = Yoshida, Suzuki, BlanesMoan, McLachlan, KahanLi, GaussLegendre, LobattoIIIAIIIB

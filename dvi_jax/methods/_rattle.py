@@ -76,7 +76,7 @@ class Rattle(Method):
         reach = jnp.where(is_zero, 0, jnp.abs(q / divisor)) + jnp.abs(velocity(p0))
         # Round-off of g(q1)/h: that of the terms of G q1, over h, and that of the velocity itself.
         zero, scale = jnp.zeros(m, q0.dtype), jnp.abs(G) @ reach.ravel()
-        if _is_separable(equations, first, second, q0, p0):
+        if is_separable(equations, first, second, q0, p0):
             root, info = find_root(
                 lambda z: violation(z, half_step(z, p0, q0)[1]), zero, scale, root_solver(equations)
             )
@@ -111,7 +111,7 @@ class Rattle(Method):
         return False
 
 
-def _is_separable(equations, first, second, q, p) -> bool:
+def is_separable(equations, first, second, q, p) -> bool:
     """Whether p½ and q1 enter no right side of their own."""
     return not (
         depends_on(lambda p: equations.momentum_rate(first, q, p), 0, p)

@@ -72,9 +72,14 @@ def own_coupling(G: Array, velocity: Callable[[State], State], p: State) -> Arra
     return jax.vmap(lambda row: row @ push(row.reshape(p.shape)).ravel())(G)
 
 
-def tangent(equations: Equations, t: Scalar, q: State, p: State) -> tuple[State, RootInfo]:
-    """p − Gᵀμ with the velocity along the constraint, G ∂H/∂p = 0."""
+def tangent(
+    equations: Equations, t: Scalar, q: State, p: State, weight: Any = 1
+) -> tuple[State, RootInfo]:
+    """p − w Gᵀμ with the velocity along the constraint, G ∂H/∂p = 0, for a diagonal w."""
     linear, velocity = Linear.of_constraint(equations, q), velocity_at(equations, t, q)
+    if not isinstance(weight, int):
+        transpose = linear.transpose
+        linear = linear._replace(transpose=lambda y: weight * transpose(y))
     normal_velocity = linear.product(velocity(p))
     A = linear.coupling(velocity, p, normal_velocity.size)
     # A velocity that is linear in p needs no iteration.

@@ -48,7 +48,8 @@ class Equations(eqx.Module):
     """The equations (12)–(13) of one step of a system, for one ε and one set of args.
 
     `newton` solves their implicit part. If there is an `origin`, positions and momenta are relative
-    to it. `increments` are the increments of the noise in the step, shape (parts of the step, m).
+    to it. `increments` are the increments of the noise in the step, shape (parts of the step, m),
+    for some methods with further rows for their areas.
     If there is a `quantum`, an explicit step changes the state by integer multiples of it.
     A rate has then the same bits in every evaluation.
     """

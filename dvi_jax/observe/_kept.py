@@ -22,21 +22,22 @@ _UNKNOWN = -(2**30)
 
 
 class StepStart(NamedTuple):
-    """Start of a step, and its end t1, which is `until` by the clock."""
+    """Start of a step, its end t1, which is `until` by the clock, and its number."""
 
     t0: Scalar
     t1: Scalar
     until: Scalar
     q0: State
     p0: State
+    k: Any = 0
 
 
 class KeptSteps(Reduction):
     """Base of the reductions that record the starts of some steps, in the order of time.
 
     `function` returns a row, see `as_row`. The first `skip` of these steps are left out. The result
-    is the rows, NaN where there are fewer than the capacity, and how many there were: NaN if it is
-    not known whether a step belongs to them.
+    is the rows, NaN where there are fewer than the capacity, how many there were: NaN if it is not
+    known whether a step belongs to them; and the numbers of these steps.
     """
 
     function: ClassVar[Callable[..., Any]]
@@ -65,10 +66,10 @@ class KeptSteps(Reduction):
         return rows, steps.at[place].set(k, mode="drop"), count + jnp.where(hit, 1, 0)
 
     def finish(self, memory) -> Any:
-        rows, _, count = memory
+        rows, steps, count = memory
         # The count is negative while the first hits are skipped.
         number = jnp.maximum(count, 0).astype(rows.dtype)
-        return rows, jnp.where(count < _UNKNOWN // 2, jnp.nan, number)
+        return rows, jnp.where(count < _UNKNOWN // 2, jnp.nan, number), steps
 
     def combine(self, memory, k, t, value):
         rows, steps, count = memory
@@ -81,11 +82,14 @@ def as_row(hit: Array, start: StepStart) -> Float[Array, " width"]:
     return jnp.concatenate([jnp.stack(parts), start.q0.ravel(), start.p0.ravel()])
 
 
-def from_rows(rows: Float[Array, "... width"], shape: tuple[int, ...]) -> tuple[Array, StepStart]:
-    """Which rows hold a step, and the steps, for positions of this shape."""
+def from_rows(
+    rows: Float[Array, "... width"], k: Array, shape: tuple[int, ...]
+) -> tuple[Array, StepStart]:
+    """Which rows hold a step, and the steps of the numbers k, for positions of this shape."""
     lead = rows.shape[:-1]
     q0, p0 = (x.reshape(*lead, *shape) for x in jnp.split(rows[..., 4:], 2, axis=-1))
-    return rows[..., 0] >= 1, StepStart(rows[..., 1], rows[..., 2], rows[..., 3], q0, p0)
+    ends = rows[..., 1], rows[..., 2], rows[..., 3]
+    return rows[..., 0] >= 1, StepStart(*ends, q0, p0, k)
 
 
 @printable

@@ -65,7 +65,9 @@ class Reduction(eqx.Module):
         # The reversible adjoint visits the steps in another order and rebuilds their values with
         # rounding, so that `update` cannot be differentiated: a maximum would be found elsewhere.
         def value_of_all(t, value):
-            return self.finish(self.combine(memory, k, t, value))
+            # Integers, such as the numbers of steps, have no cotangent.
+            result = self.finish(self.combine(memory, k, t, value))
+            return eqx.filter(result, eqx.is_inexact_array)
 
         return jax.vjp(value_of_all, t, value)[1](cotangent)
 

@@ -19,7 +19,7 @@ from ..lattices import Given, Lattice
 from ..methods import Method
 from ..observe import Stop
 from ..observe.solution import Save
-from ..problem.noise import as_path
+from ..problem.paths import as_path
 from ..problem.system import System, check_system, of_problem
 from .axes import Axis, as_axis, axes_in, is_axis, lengths
 from .plan import make_plan, on_devices
