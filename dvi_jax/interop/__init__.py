@@ -9,6 +9,7 @@ from .diffrax_side import diffrax_solver as diffrax_solver, diffrax_term as diff
 from .fields import vector_field as vector_field
 from .rebound_side import (
     ReboundProblem as ReboundProblem,
+    from_archive as from_archive,
     from_rebound as from_rebound,
     to_rebound as to_rebound,
 )
