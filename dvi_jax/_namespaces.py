@@ -52,7 +52,7 @@ HOMES = {
     ),
     "explorer": ("Explorer", "explore"),
     "fit": (
-        *("FIT_RESULTS", "Bounds", "Cauchy", "FitError", "FitProgress", "FitResult"),
+        *("FIT_RESULTS", "Bounds", "Cauchy", "EventTimes", "FitError", "FitProgress", "FitResult"),
         *("ForceLibrary", "Identification", "LeastSquares", "Likelihood", "Model"),
         *("MultipleShooting", "NetworkForce", "Observations", "Posterior", "Prior", "Samples"),
         *("SingleShooting", "SoftL1", "fit", "identify", "sample"),

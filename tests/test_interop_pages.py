@@ -27,9 +27,11 @@ def test_the_page_on_interoperability_runs(tmp_path, monkeypatch):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     names, count = run("interoperability.md")
-    assert count == 7
+    assert count == 8
     # Two programs of one map: the round-off of 160 steps, 2e-16 each.
     assert names["apart"] < 160 * 2.2e-16
+    assert names["series"].sizes["time"] == 11
+    assert abs(names["series"].e.sel(body="Saturn").max() - 0.06) < 0.02
     assert 1e-5 < names["error_of_the_map"] < 1e-1
     assert names["from_theirs"] < 1e-10
     np.testing.assert_allclose(*names["energies"], rtol=1e-12)

@@ -155,6 +155,145 @@ def test_a_file(tmp_path):
         interop.from_rebound(path, snapshot=7)
 
 
+# --- archives
+
+
+def archive_of(path, sim, times, between=None):
+    """A file with a snapshot at each time; `between` is called after each."""
+    for i, t in enumerate(times):
+        sim.integrate(t)
+        sim.save_to_file(str(path))
+        if between is not None:
+            between(i, sim)
+    return path
+
+
+def as_read(path, name):
+    """A field of the particles of all snapshots, as REBOUND reads it, in its order of bodies."""
+    rows = []
+    for sim in rebound.Simulationarchive(str(path)):
+        sim.synchronize()
+        rows.append([getattr(b, name) for b in sim.particles])
+    return rows
+
+
+@pytest.mark.filterwarnings("ignore:The simulation might not be synchronized:RuntimeWarning")
+@pytest.mark.parametrize("options", [{}, {"integrator": "whfast"}], ids=["ias15", "whfast"])
+def test_an_archive_as_a_time_series(tmp_path, options):
+    """The bits of REBOUND, also from snapshots between half steps; names, units, elements."""
+    sim, path = three_bodies(**options), tmp_path / "archive.bin"
+    if options:
+        sim.integrator.safe_mode = 0
+        sim.save_to_file(str(path), step=100)
+        sim.integrate(7.5)
+    else:
+        archive_of(path, sim, np.arange(3.0, 8.0))
+    archive = rebound.Simulationarchive(str(path))
+    assert archive[3].is_synchronized == (not options)
+    data = interop.from_archive(path, elements="jacobi")
+    assert data.sizes == {"time": 5, "body": 3, "component": 3}
+    assert list(data.body.values) == ["Sun", "giant", "body 2"]
+    np.testing.assert_array_equal(data.time, [archive.t[i] for i in range(5)])
+    for k, component in enumerate("xyz"):
+        np.testing.assert_array_equal(data.q[..., k], as_read(path, component))
+        np.testing.assert_array_equal(data.v[..., k], as_read(path, f"v{component}"))
+    for name in ("m", "r"):
+        np.testing.assert_array_equal(data[name], as_read(path, name))
+    assert (data.q.units, data.v.units, data.m.units) == ("au", "au/yr", "Msun")
+    assert (data.time.units, data.a.units, data.M.units) == ("yr", "au", "rad")
+    assert "units" not in data.e.attrs
+    assert data.attrs["G"] == sim.G
+    np.testing.assert_array_equal(data["count"], 3)
+    for kind, primary in (("jacobi", None), ("heliocentric", 0)):
+        data = interop.from_archive(archive, elements=kind)
+        assert np.isnan(data.a.sel(body="Sun")).all()
+        for i in range(5):
+            body = archive[i]
+            body.synchronize()
+            origin = {} if primary is None else {"primary": body.particles[primary]}
+            for row, orbit in enumerate(body.orbits(**origin), start=1):
+                theirs = [orbit.a, orbit.e, orbit.inc]
+                ours = [data[name][i, row] for name in ("a", "e", "inc")]
+                np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-10)
+                angle = data.M[i, row] - orbit.M
+                np.testing.assert_allclose(np.exp(1j * angle), 1.0, atol=1e-8)
+    # The control: the other kind of elements differs.
+    assert np.abs(data.a - interop.from_archive(path, elements="jacobi").a).max() > 1e-4
+
+
+def test_bodies_of_an_archive_that_come_and_go(tmp_path):
+    """Bodies with names are identified by them; of others it may not be known which was removed."""
+
+    def change(i, sim):
+        if i == 0:
+            sim.remove("giant")
+        if i == 1:
+            sim.add(m=1e-6, a=5.0, name="comet")
+        if i == 2:
+            sim.add(m=1e-3, a=1.2, name="giant")
+
+    # Of several files, since REBOUND itself reads names of some of them wrongly in this process.
+    for k in range(8):
+        times = [3.0, 3.5, 4.0, 4.5]
+        path = archive_of(tmp_path / f"named{k}.bin", three_bodies(), times, change)
+        assert list(interop.from_archive(path).body.values) == ["Sun", "giant", "body 2", "comet"]
+    data = interop.from_archive(path, elements="jacobi")
+    assert list(data.body.values) == ["Sun", "giant", "body 2", "comet"]
+    np.testing.assert_array_equal(data["count"], [3, 2, 3, 4])
+    exists = [[1, 1, 1, 0], [1, 0, 1, 0], [1, 0, 1, 1], [1, 1, 1, 1]]
+    for name in ("q", "v"):
+        np.testing.assert_array_equal(np.isfinite(data[name]).all("component"), exists)
+    np.testing.assert_array_equal(np.isfinite(data.a), np.array(exists) * [0, 1, 1, 1])
+    np.testing.assert_array_equal(data.m.sel(body="body 2"), 1e-4)
+    of_second = [row[1] for row in as_read(path, "x")]
+    assert of_second[1] == float(data.q.sel(body="body 2")[1, 0])
+
+    def remove(i, sim):
+        if i == 0:
+            sim.add(m=1e-6, a=5.0)
+        if i == 1:
+            sim.remove(2)
+
+    path = archive_of(tmp_path / "unnamed.bin", three_bodies(), [3.0, 3.5, 4.0], remove)
+    with pytest.warns(UserWarning, match="number of bodies with the same name .None. changes"):
+        data = interop.from_archive(path)
+    np.testing.assert_array_equal(data["count"], [3, 4, 3])
+    assert np.isnan(data.q[2, 3]).all()
+    assert "a" not in data
+
+
+def test_variations_and_no_units_in_an_archive(tmp_path):
+    sim = three_bodies()
+    sim.add_variation()
+    data = interop.from_archive(archive_of(tmp_path / "variation.bin", sim, [3.0, 3.1]))
+    assert data.sizes["body"] == 3
+    sim = rebound.Simulation()
+    sim.add(m=1.0)
+    sim.add(a=1.0)
+    data = interop.from_archive(archive_of(tmp_path / "plain.bin", sim, [0.0]))
+    assert "units" not in data.q.attrs
+    assert list(data.body.values) == ["body 0", "body 1"]
+
+
+def test_files_that_are_no_archives(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no file at the path"):
+        interop.from_archive(tmp_path / "none.bin")
+    bad = tmp_path / "bad.bin"
+    for content in (b"", b"no archive of REBOUND" * 100):
+        bad.write_bytes(content)
+        with pytest.raises(ValueError, match=r"cannot read the archive .*bad\.bin"):
+            interop.from_archive(bad)
+    with pytest.raises(TypeError, match="the path of a Simulationarchive"):
+        interop.from_archive(three_bodies())
+    path = archive_of(tmp_path / "archive.bin", three_bodies(), [3.0, 3.5])
+    with pytest.raises(ValueError, match="elements must be"):
+        interop.from_archive(path, elements="democratic")
+    # A file that was cut: REBOUND reads the snapshots before the cut, and warns.
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.warns(RuntimeWarning, match="corrupt"):
+        assert interop.from_archive(path).sizes["time"] == 1
+
+
 @pytest.mark.parametrize("name", ["x", "vz", "m", "t", "G"])
 def test_numbers_that_are_not_finite(name):
     sim = three_bodies()

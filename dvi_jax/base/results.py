@@ -55,8 +55,8 @@ class RESULTS(eqx.Enumeration):
     stopped = "The condition of dvi.Stop was met: the trajectory ended before its last step."
     not_reached = (
         "A time of dvi.Save(ts=...) lies outside of the run: before its start, or after its last "
-        "step; or a clock does not grow along the trajectory. Take more steps, or leave out those "
-        "times."
+        "step; or a clock does not grow along the trajectory; or there is no event that belongs to "
+        "a time of dvi.EventTimes. Take more steps, or leave out those times."
     )
     step_control_failed = (
         "The step sizes of dvi.AdaptiveReversible(g) no longer follow g: a step has another sign "

@@ -2,6 +2,7 @@
 
 from ._fit import fit as fit
 from .bayes import Samples as Samples, sample as sample
+from .events import EventTimes as EventTimes
 from .identify import Identification as Identification, Removal as Removal, identify as identify
 from .library import ForceLibrary as ForceLibrary
 from .losses import (

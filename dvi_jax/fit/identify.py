@@ -326,7 +326,7 @@ def _with_errors(arc: Observations) -> Observations:
     if arc.has_errors:
         return arc
     scatter = float(np.nanstd(arc.values)) or float(np.nanmax(np.abs(arc.values))) or 1.0
-    return replace(arc, sigma=_PROVISIONAL_ERROR * scatter)
+    return replace(arc, sigma=np.full(arc.values.shape, _PROVISIONAL_ERROR * scatter))
 
 
 def _guard(

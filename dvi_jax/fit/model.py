@@ -15,19 +15,20 @@ from lanewise.jaxprs.jaxapi import is_traced
 from ..base.checks import instance, whole
 from ..base.inputs import as_parameter, start_state
 from ..base.printing import printable
-from ..base.results import RESULTS
+from ..base.results import RESULTS, first_failure
 from ..base.signature import accepts, output_of
 from ..discover.functions.basis import check_step_size
 from ..integration.integrate import integrate
 from ..integration.integrator import Integrator
 from ..lattices import Uniform
 from ..methods import GaussLegendre, Method
-from ..observe import refuse_slow_time
+from ..observe import Section, refuse_slow_time
 from ..observe.solution import Save
 from ..problem.system import System
+from .events import computed_times
 from .first_order import LibraryField, field_of, first_order_system
 from .library import ForceLibrary
-from .observations import Observations
+from .observations import JoinedObservations, Observations
 
 # Steps beyond the ends of shorter arcs above which another program is compiled for them.
 _WASTE = 2_000_000
@@ -222,6 +223,8 @@ class Group(eqx.Module):
     `arcs` (A,), `t0` (A,), `ts` (A, N), `values` and `mask` (A, N, K), `whiten` (A, N, K) or
     (A, N, K, K), `period` (A, K) or None. Padding is not seen, and has the time of the last
     observation. `block` and `pick` say how observations are found on the time grid, see `predict`.
+    `kinds`: arguments of the `Section` of each event, the last E components of the values; `events`
+    their `EventTimes.rows`, (A, N, E, 3).
     """
 
     arcs: np.ndarray
@@ -235,6 +238,8 @@ class Group(eqx.Module):
     observe: Callable[..., Any] = eqx.field(static=True)
     num_steps: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
+    kinds: tuple[tuple[Callable[..., Any], int, int], ...] = eqx.field(static=True, default=())
+    events: np.ndarray | None = None
 
 
 def weigh(residual: Any, whiten: Any) -> Any:
@@ -265,6 +270,7 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     for i, (arc, spec) in enumerate(pairs):
         size = math.ceil(math.log2(steps[i])) if separate else 0
         key = (arc.function, arc.values.shape[1:], arc.covariance is not None, size, spec["h"])
+        key += tuple((kind.g, kind.direction) for kind in getattr(arc, "kinds", ()))
         kinds.setdefault(key, []).append(i)
     return [
         make_group(n, [arcs[i] for i in n], specs[n[0]], max(steps[i] for i in n))
@@ -289,7 +295,8 @@ def _steps(arc: Observations, spec: Mapping[str, Any]) -> int:
     if not _is_uniform(spec):
         hint = "A lattice other than dvi.Uniform() requires it."
         return whole("num_steps of the model", spec.get("num_steps"), hint=hint)
-    return max(1, math.ceil((arc.ts[-1] - arc.t0) / float(spec["h"]) - 1e-9))
+    end: Any = arc.reach if isinstance(arc, JoinedObservations) else arc.ts[-1]
+    return max(1, math.ceil((end - arc.t0) / float(spec["h"]) - 1e-9))
 
 
 def make_group(numbers: list[int], arcs: list[Any], spec: Mapping, num_steps: int) -> Group:
@@ -305,6 +312,10 @@ def make_group(numbers: list[int], arcs: list[Any], spec: Mapping, num_steps: in
         return arc.values.reshape(len(arc.ts), -1)
 
     ts, t0 = stack(lambda arc: arc.ts, mode="edge"), np.array([arc.t0 for arc in arcs])
+    kinds = [
+        (same[0].g, same[0].direction, max(kind.max_events for kind in same))
+        for same in zip(*(getattr(arc, "kinds", ()) for arc in arcs), strict=True)
+    ]
     block, pick = 0, None
     if _is_uniform(spec):
         block, pick = _blocks((ts - t0[:, None]) / float(spec["h"]), num_steps)
@@ -320,6 +331,8 @@ def make_group(numbers: list[int], arcs: list[Any], spec: Mapping, num_steps: in
         block=block,
         pick=pick,
         period=_periods(arcs),
+        kinds=tuple(kinds),
+        events=stack(lambda arc: arc.rows, constant_values=np.nan) if kinds else None,
     )
 
 
@@ -349,29 +362,42 @@ def _blocks(places: np.ndarray, num_steps: int) -> tuple[int, np.ndarray | None]
 
 
 def predict(
-    spec: dict[str, Any], t0: Array, ts: Array, pick: Array | None, group: Group
+    spec: dict[str, Any], t0: Array, ts: Array, pick: Any, group: Group, events: Any = None
 ) -> tuple[Array, tuple[Array, Array], RESULTS]:
     """Predicted observations along one arc, shape (N, K), the last state and the status.
 
     On a uniform time grid states are saved every `block` steps. Observations on them are picked;
     others are reached from the saved state before by `block` equal steps of their own, none longer
     than h. So an observation has the order of the method, each step runs in the fast loop, and
-    memory grows with the number of observations, not of steps.
+    memory grows with the number of observations, not of steps. `events`: those of the group for
+    this arc, (N, E, 3).
     """
     spec = {**spec, "t0": t0, "throw": False}
-    if group.block == 0:
-        sol = integrate(**spec, save=Save(ts=ts))
-        qs, ps = sol.qs, sol.ps
-    else:
+    spec |= {"observe": [Section(*kind) for kind in group.kinds]} if group.kinds else {}
+    if group.block > 0:
         spec["num_steps"] = group.num_steps
-        sol = integrate(**spec, save=Save(every=group.block, final=True))
-        if pick is None:
+    save = Save(every=group.block, final=True) if group.block > 0 else Save(ts=ts)
+    has_states = group.values.shape[-1] > len(group.kinds)
+    sol = integrate(**spec, save=save if has_states else Save(final=True))
+    result, end, rows = sol.result, (sol.qs[-1], sol.ps[-1]), jnp.zeros((len(ts), 0))
+    if has_states:
+        qs, ps = sol.qs, sol.ps
+        if group.block > 0 and pick is None:
+            spec.pop("observe", None)
             qs, ps = _states_off_grid(spec, t0, ts, sol, group)
-        else:
+        elif group.block > 0:
             qs, ps = sol.qs[pick], sol.ps[pick]
-    args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, spec.get("args"))
-    values = jax.vmap(lambda t, q, p: group.observe(t, q, p, args))(ts, qs, ps)
-    return jnp.reshape(values, (len(ts), -1)), (sol.qs[-1], sol.ps[-1]), sol.result
+        args = jax.tree.map(
+            lambda x: jnp.asarray(x) if isinstance(x, float) else x, spec.get("args")
+        )
+        values = jax.vmap(lambda t, q, p: group.observe(t, q, p, args))(ts, qs, ps)
+        rows = jnp.reshape(values, (len(ts), -1))
+    for i, crossed in enumerate(sol.observed if group.kinds else ()):
+        times = computed_times(crossed, events[:, i])
+        is_missing = jnp.any(jnp.isnan(times) & ~jnp.isnan(events[:, i, 0]))
+        status = RESULTS.where(is_missing, RESULTS.not_reached, RESULTS.successful)
+        rows, result = jnp.column_stack([rows, times]), first_failure(result, status)
+    return rows, end, result
 
 
 def _states_off_grid(spec: dict[str, Any], t0: Array, ts: Array, sol: Any, group: Group):
@@ -404,13 +430,15 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool
     q, p = start_state(spec["q0"], spec["p0"])
     args = jax.tree.map(as_parameter, spec.get("args"))
     out = output_of(f"observe of arc {i}", arc.function, jnp.asarray(arc.t0), q, p, args)
-    shape, row_shape = out.shape, arc.values.shape[1:]
+    shape, row_shape = out.shape, getattr(arc, "plain_shape", arc.values.shape[1:])
+    if row_shape is None:  # there are only events
+        return False
     if row_shape == () and shape == (1,) and arc.covariance is None:
         return True
     if shape != row_shape:
         name = f"observe={arc.observe!r}" if isinstance(arc.observe, str) else "observe"
         raise ValueError(
-            f"arc {i}: values has shape {arc.values.shape}, so observe must return shape "
+            f"arc {i}: values has shape {(len(arc.ts), *row_shape)}, so observe must return shape "
             f"{row_shape}, got shape {shape} from {name} for q of shape {q.shape}."
         )
     return False

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +11,10 @@ from ..base.checks import finite, instance
 from ..base.inputs import refuse_unit_or_mask
 from ..base.printing import printable
 from ..base.signature import with_time
-from .checks import require_all, require_shape
+from .arrays import check_times, covariance_of, period_of, real_array, sigma_of
+from .checks import require_all, requires
+from .events import EventTimes
 
-# Standard errors relative to the largest value for which a sum of squares can be computed.
-_RANGE = (1e-140, 1e140)
 # Observables of a state that have a name.
 OBSERVABLES: dict[str, Callable[..., Any]] = {
     "positions": lambda t, q, p, args: q,
@@ -47,7 +47,12 @@ class Observations:
       are between −period/2 and period/2, and the predictions of a result on the branch nearest to
       the observed values.
 
-    Observations of several kinds along one arc are one `observe` that returns them all, at
+    - `events`: observed times of events on the same arc, an `EventTimes` or several, one for each
+      planet for instance; `ts` and `values` may then be left out. t0 is required, best shortly
+      before the first event. A result has their times as the last components, at the union of all
+      times, NaN where an event was not observed.
+
+    Other observations of several kinds along one arc are one `observe` that returns them all, at
     the union of their times, with NaN for what was not observed.
 
     **Raises** `ValueError` or `TypeError` for invalid input: times that are not finite, not in
@@ -55,20 +60,31 @@ class Observations:
     that are zero, negative or NaN; a covariance that is not positive definite.
     """
 
-    ts: Any
-    values: Any
+    ts: Any = None
+    values: Any = None
     observe: str | Callable[..., Any] = "positions"
     sigma: Any = None
     covariance: Any = None
     t0: float | None = None
     period: Any = None
+    events: Any = ()
     t0_is_given: bool = field(init=False, default=False, repr=False)
+    _by_time: ClassVar[tuple[str, ...]] = ("ts", "values", "sigma", "covariance")
 
     def __post_init__(self):
         values = self.values
         if np.ma.is_masked(values):
             values = np.ma.filled(values.astype(float), np.nan)
-        ts, values = _real("ts", self.ts), _real("values", values)
+        events = (self.events,) if isinstance(self.events, EventTimes) else tuple(self.events)
+        for i, kind in enumerate(events):
+            instance(f"events[{i}]", kind, EventTimes, "a dvi.EventTimes")
+        ts = self.ts
+        if events and ts is None and values is None:
+            ts, values = np.zeros(0), np.zeros((0, 0))
+            fits = all(x is None for x in (self.sigma, self.covariance, self.period))
+            rule = "ts and values (dvi.EventTimes has its own sigma)"
+            requires(fits, "sigma, covariance or period", rule, "events alone")
+        ts, values = real_array("ts", ts), real_array("values", values)
         is_name, observe = isinstance(self.observe, str), self.observe
         if is_name and observe not in OBSERVABLES:
             raise TypeError(
@@ -78,32 +94,42 @@ class Observations:
         if not is_name:
             hint = 'or "positions", "momenta" or "state"'
             object.__setattr__(self, "observe", with_time(f"observe ({hint})", observe))
-        if ts.ndim != 1 or ts.size == 0 or values.shape[:1] != ts.shape:
+        if ts.ndim != 1 or (ts.size == 0 and not events) or values.shape[:1] != ts.shape:
             raise ValueError(
                 "ts must be a one-dimensional array of times, not empty, and values must have one "
                 f"row for each, got shapes {ts.shape} and {values.shape}."
             )
-        _check_times(ts)
+        check_times(ts)
         require_all("values", values, ~np.isinf(values), "finite", "NaN means a missing value.")
-        if np.isnan(values).all():
+        if values.size and np.isnan(values).all():
             count = values.size
             raise ValueError(f"values must have at least one number, got {count} values, all NaN.")
         refuse_unit_or_mask("t0", self.t0)
+        requires(self.t0 is not None or not events, "events of dvi.Observations", "t0", "None")
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
-        if ts.min() < t0 < ts.max():
+        times = np.concatenate([ts, *(kind.times for kind in events)])
+        if times.min() < t0 < times.max():
             raise ValueError(
-                f"ts must be on one side of t0 = {t0}, got times from {ts.min()} to {ts.max()}. "
+                f"ts must be on one side of t0 = {t0}, got times from {times.min()} to "
+                f"{times.max()}. "
                 "Leave out those before t0, or fit the state at the first time: t0=ts[0]."
             )
-        fields: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
+        hint = "A start at an event is no event of a run: give an earlier t0, or a later one."
+        is_start = any(t0 in kind.times for kind in events)
+        requires(not is_start, "an event", "a time other than t0", f"t0 = {t0}", hint)
+        fields: dict[str, Any] = {"ts": ts, "values": values, "t0": t0, "events": events}
         if self.sigma is not None:
-            fields["sigma"] = _sigma(self.sigma, values)
+            fields["sigma"] = sigma_of(self.sigma, values)
         if self.covariance is not None:
             if self.sigma is not None:
                 raise ValueError("only one of sigma and covariance can be given, got both.")
-            fields["covariance"] = _covariance(self.covariance, values)
+            fields["covariance"] = covariance_of(self.covariance, values)
         if self.period is not None:
-            fields["period"] = _period(self.period, values.shape[1:])
+            fields["period"] = period_of(self.period, values.shape[1:])
+        errors = [self.sigma is not None or self.covariance is not None] * bool(ts.size)
+        errors += [kind.sigma is not None for kind in events]
+        fits = all(errors) or not (any(errors) or (events and ts.size))
+        requires(fits, "an arc of several kinds", "sigma of all of them", f"{errors}")
         fields["t0_is_given"] = self.t0 is not None
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -122,7 +148,7 @@ class Observations:
         """The same observations in the order in which a run from t0 reaches them."""
         if abs(self.ts[0] - self.t0) <= abs(self.ts[-1] - self.t0):
             return self
-        fields = {name: getattr(self, name) for name in ("ts", "values", "sigma", "covariance")}
+        fields = {name: getattr(self, name) for name in self._by_time}
         return replace(self, **{n: None if x is None else x[::-1] for n, x in fields.items()})
 
     @property
@@ -133,7 +159,8 @@ class Observations:
     @property
     def has_errors(self) -> bool:
         """Whether sigma or covariance was given."""
-        return self.sigma is not None or self.covariance is not None
+        of_values = self.sigma is not None or self.covariance is not None
+        return of_values or any(kind.sigma is not None for kind in self.events)
 
     @property
     def errors(self) -> np.ndarray:
@@ -161,18 +188,70 @@ class Observations:
         return factors
 
 
+@dataclass(frozen=True, eq=False)
+class JoinedObservations(Observations):
+    """Values and event times of one arc at the union of their times, shape (N, K + E).
+
+    `plain_shape`: the shape of one value, None if there are only events. `kinds`: the E events,
+    `rows` their `EventTimes.rows`, (N, E, 3). `reach`: the time that a run has to reach.
+    """
+
+    plain_shape: tuple[int, ...] | None = None
+    kinds: tuple[EventTimes, ...] = ()
+    rows: Any = None
+    reach: float = 0.0
+    _by_time: ClassVar[tuple[str, ...]] = (*Observations._by_time, "rows")
+
+    def __post_init__(self):  # the parts have been checked
+        object.__setattr__(self, "t0_is_given", True)
+
+    def in_columns(self) -> "JoinedObservations":
+        return self
+
+
+def joined(arc: Observations) -> Observations:
+    """The arc with its events as further components of its values."""
+    if not arc.events:
+        return arc
+    t0, kinds = arc.t0, tuple(kind.ordered(t0=arc.t0) for kind in arc.events)
+    ts = np.unique(np.concatenate([arc.ts, *(kind.times for kind in kinds)]))
+    n, k = len(ts), arc.components
+    values, errors = np.full((2, n, k + len(kinds)), np.nan)
+    rows, period = np.full((n, len(kinds), 3), np.nan), np.full(k + len(kinds), np.inf)
+    place = np.searchsorted(ts, arc.ts)
+    values[place, :k] = arc.values.reshape(len(place), k)
+    errors[place, :k] = arc.errors.reshape(len(place), k)
+    for i, kind in enumerate(kinds):
+        moment = np.searchsorted(ts, kind.times)
+        values[moment, k + i] = kind.times
+        errors[moment, k + i] = np.nan if kind.sigma is None else kind.sigma
+        rows[moment, i] = kind.rows(t0)
+    fields: dict[str, Any] = {"sigma": errors if arc.has_errors else None}
+    if arc.covariance is not None:
+        C = np.eye(k + len(kinds)) * np.where(np.isnan(errors), 1.0, errors)[:, None] ** 2
+        C[place, :k, :k] = arc.covariance
+        fields = {"covariance": C}
+    if arc.period is not None:
+        period[:k] = arc.period.ravel()
+        fields["period"] = period
+    ends = [kind.end(t0) for kind in kinds] + [arc.ts[i] for i in (0, -1) if k]
+    fields |= {"reach": max(ends, key=lambda t: abs(t - t0)), "kinds": kinds, "rows": rows}
+    shape = arc.values.shape[1:] if k else None
+    return JoinedObservations(ts, values, arc.observe, t0=t0, plain_shape=shape, **fields)
+
+
 # One arc, or several.
 Data: TypeAlias = Observations | list[Observations] | tuple[Observations, ...]
 
 
 def as_arcs(data: Any) -> tuple[list[Observations], bool]:
-    """The arcs, and whether they were given as a list.
+    """The arcs, with their events as components, and whether they were given as a list.
 
     **Raises** `TypeError` for anything but `Observations`, `ValueError` for an empty list and when
     some arcs have errors and some have none.
     """
     if isinstance(data, Observations):
-        return [data], False
+        return [joined(data)], False
     instance("data", data, list | tuple, "a dvi.Observations or a list of them, one for each arc")
     if not data:
         raise ValueError(f"data must contain at least one dvi.Observations, got {data!r}.")
@@ -184,69 +263,7 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
             "all arcs must have sigma or covariance, or none of them, got one for "
             f"data[{flags.index(True)}], but not for data[{flags.index(False)}]."
         )
-    return list(data), True
-
-
-def _real(name: str, value: Any) -> np.ndarray:
-    refuse_unit_or_mask(name, value)
-    try:
-        array = np.asarray(value)
-        kind = f"dtype {array.dtype}"
-    except (TypeError, ValueError) as error:  # rows of unequal length
-        array, kind = np.array(None), f"{type(value).__name__}: {str(error).partition(chr(10))[0]}"
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"{name} must be an array of real numbers, got {kind}.")
-    return array.astype(float)
-
-
-def _first(where: np.ndarray) -> list[int]:
-    """The first index at which an array is true; an empty list if it is false everywhere."""
-    return np.argwhere(where)[0].tolist() if where.any() else []
-
-
-def _check_times(ts: np.ndarray) -> None:
-    require_all("ts", ts, np.isfinite(ts), "finite")
-    steps = np.diff(ts)
-    is_up = (steps > 0).sum() >= (steps < 0).sum()
-    if index := _first(steps <= 0 if is_up else steps >= 0):
-        [i] = index
-        raise ValueError(
-            "ts must all increase or all decrease, and no two be equal, got "
-            f"ts[{i}] = {ts[i]} and ts[{i + 1}] = {ts[i + 1]}. Sort the rows by np.argsort(ts); "
-            "give one row for each time."
-        )
-
-
-def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
-    sigma = _real("sigma", sigma)
-    try:
-        full = np.array(np.broadcast_to(sigma, values.shape))
-    except ValueError:
-        raise ValueError(
-            f"sigma must broadcast to the shape {values.shape} of values, got shape {sigma.shape}."
-        ) from None
-    is_missing = np.isnan(values)
-    is_valid = np.isfinite(full) & (full > 0) | is_missing
-    require_all("sigma", full, is_valid, "positive and finite", "To ignore a value, set it to NaN.")
-    largest = np.nanmax(np.abs(values))
-    low, high = (factor * (largest or 1.0) for factor in _RANGE)
-    rule = f"between {low:.3g} and {high:.3g} for values of up to {largest:.3g}"
-    is_valid = (full > low) & (full < high) | is_missing
-    require_all("sigma", full, is_valid, rule, "Give sigma in the units of the values.")
-    return full
-
-
-def _period(period: Any, shape: tuple[int, ...]) -> np.ndarray:
-    period = _real("period", period)
-    try:
-        full = np.array(np.broadcast_to(period, shape))
-    except ValueError:
-        raise ValueError(
-            f"period must broadcast to the shape {shape} of one value, got shape {period.shape}."
-        ) from None
-    hint = "An infinite one is that of a component that is not periodic."
-    require_all("period", full, full > 0, "positive", hint)
-    return full
+    return [joined(arc) for arc in data], True
 
 
 def nearest_branch(values: Any, observed: Any, period: Any) -> Any:
@@ -257,39 +274,3 @@ def nearest_branch(values: Any, observed: Any, period: Any) -> Any:
     period = jnp.broadcast_to(period, values.shape)
     turns = jnp.round((values - observed) / period)
     return values - jnp.where(jnp.isfinite(period), period, 0.0) * turns
-
-
-def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
-    C = _real("covariance", covariance)
-    n, k = len(values), int(np.prod(values.shape[1:], dtype=int))
-    require_shape("covariance", C, (k, k), (n, k, k))
-    full = np.array(np.broadcast_to(C, (n, k, k)))
-    variance = np.einsum("nii->ni", full)
-    scale = np.sqrt(np.abs(variance))
-    skew = np.abs(full - full.swapaxes(1, 2)).max(axis=(1, 2))
-    # The comparison is written so that NaN is refused.
-    if index := _first(~(skew <= 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny))):
-        [i] = index
-        asymmetry = np.nan_to_num(np.abs(full[i] - full[i].T), nan=np.inf, posinf=np.inf)
-        a, b = np.unravel_index(np.argmax(asymmetry), asymmetry.shape)
-        hint = "Against round-off give (C + C.T) / 2."
-        if not np.isfinite(asymmetry[a, b]):
-            hint = "Mark a missing value by NaN in values only."
-        raise ValueError(
-            f"the covariance of observation {i} must be symmetric and finite, got {full[i, a, b]} "
-            f"at [{a}, {b}] and {full[i, b, a]} at [{b}, {a}]. {hint}"
-        )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        unit = full / (scale[:, :, None] * scale[:, None, :])
-    good = np.isfinite(unit).all(axis=(1, 2)) & (variance > 0).all(axis=1)
-    smallest = np.linalg.eigvalsh(np.where(good[:, None, None], unit, np.eye(k)))[:, 0]
-    if index := _first(~good | (smallest <= 1e-14)):
-        [i] = index
-        description = f"an eigenvalue of {smallest[i]:.3g} of its correlation matrix"
-        if not good[i]:  # then the correlation matrix is not defined
-            description = f"a variance of {variance[i].min():.3g}"
-        raise ValueError(
-            f"the covariance of observation {i} must be positive definite, got {description}. "
-            "Leave out values or combinations that are known exactly."
-        )
-    return full

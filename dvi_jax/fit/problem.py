@@ -45,12 +45,12 @@ class Core(eqx.Module):
     def predict(self, params: PyTree, group: Group) -> tuple[Array, RESULTS]:
         """Predictions (A, N, K) and a status for each arc of a group."""
 
-        def predict_arc(arc, t0, ts, pick, observed, period):
+        def predict_arc(arc, t0, ts, pick, observed, period, events):
             spec = specification(self.model, params, arc, self.is_list)
-            values, _, result = predict(spec, t0, ts, pick, group)
+            values, _, result = predict(spec, t0, ts, pick, group, events)
             return nearest_branch(values, observed, period), result
 
-        names = ("arcs", "t0", "ts", "pick", "values", "period")
+        names = ("arcs", "t0", "ts", "pick", "values", "period", "events")
         arrays = jax.tree.map(jnp.asarray, tuple(getattr(group, name) for name in names))
         if len(group.arcs) == 1:  # a batch of one takes twice the time of a single trajectory
             values = predict_arc(*jax.tree.map(lambda x: x[0], arrays))
@@ -224,7 +224,8 @@ class FitProblem:
             if check_observable(i, arc, self.specs[i]):
                 arcs[i], self.data[i] = arc.in_columns(), self.data[i].in_columns()
         self.groups = make_groups(arcs, self.specs)
-        values_read = reads(model, loss, [arc.function for arc in arcs])
+        functions = [kind[0] for group in self.groups for kind in group.kinds]
+        values_read = reads(model, loss, [arc.function for arc in arcs] + functions)
         self.core = Core(model, tuple(self.groups), self.space, loss, is_list, values_read)
         self.count = int(sum(group.mask.sum() for group in self.groups))
 
@@ -309,6 +310,8 @@ class FitProblem:
                     hint = f"a smaller h: the status of the trajectory is {str(names[a])!r}"
                     if str(names[a]) == "successful":
                         hint = "another observe: the trajectory does not fail"
+                    if group.kinds and str(names[a]) == "not_reached":
+                        hint = "another g, direction or max_events: there is no such event"
                     value, t = values[~np.isfinite(values)][0], group.ts[a, first]
                     moment = f"the first observation of arc {arc}, at t = {t:g}"
                     self._refuse_start(f"{value} for {moment}", hint)

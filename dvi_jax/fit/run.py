@@ -151,7 +151,7 @@ def identity(problem: FitProblem, u: np.ndarray, *settings_of_call: Any) -> str:
     read = [(name, mark) for name, mark in marks if mark[0] == "value"]
     settings = repr((problem.space.names, problem.loss, *settings_of_call, read))
     settings = re.sub(r" at 0x[0-9a-f]+", "", settings)
-    groups = [(g.ts, g.values, g.mask, g.whiten, g.t0, g.period) for g in problem.groups]
+    groups = [(g.ts, g.values, g.mask, g.whiten, g.t0, g.period, g.events) for g in problem.groups]
     steps = [(group.num_steps, group.block) for group in problem.groups]
     arrays = eqx.filter((u, problem.space, problem.core.model, groups), eqx.is_array_like)
     digest = hashlib.sha256((settings + repr(steps)).encode())

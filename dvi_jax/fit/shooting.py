@@ -94,6 +94,8 @@ class Segments:
             "lattice=dvi.Uniform() and the same h for all arcs",
             type(lattice).__name__ if other is None else f"h = {spec['h']} and h = {other}",
         )
+        fits = not problem.groups[0].kinds
+        requires(fits, "dvi.MultipleShooting", "observations without events", "dvi.EventTimes")
         names = "observe", "the shape of an observation", "the use of covariance"
         kinds = [(a.function, a.values.shape[1:], a.covariance is None) for a in arcs]
         for i, kind in enumerate(kinds):

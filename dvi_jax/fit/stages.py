@@ -177,10 +177,14 @@ def _horizon(problem: FitProblem, horizons: Any, number: int, rows: list, at_lea
 
 
 def _scatter(group: Group) -> np.ndarray:
-    """Observed values minus their mean over the arc, in standard errors, (A, N, K)."""
+    """Observed values minus their mean over the arc, in standard errors, (A, N, K); for times of
+    events the standard deviation of a time at random between two of them."""
     count = np.maximum(group.mask.sum(axis=1, keepdims=True), 1)
     mean = np.where(group.mask, group.values, 0).sum(axis=1, keepdims=True) / count
-    return weigh(np.where(group.mask, group.values - mean, 0.0), group.whiten)
+    scatter = group.values - mean
+    if group.events is not None:
+        scatter[..., -len(group.kinds) :] = group.events[..., 2] / np.sqrt(12)
+    return weigh(np.where(group.mask, scatter, 0.0), group.whiten)
 
 
 # ---- what gradient methods need

@@ -10,6 +10,7 @@ from .fields import vector_field as vector_field
 from .jplephem_side import EphemerisPath as EphemerisPath, ephemeris_path as ephemeris_path
 from .rebound_side import (
     ReboundProblem as ReboundProblem,
+    from_archive as from_archive,
     from_rebound as from_rebound,
     to_rebound as to_rebound,
 )

@@ -1,5 +1,8 @@
-"""Simulations of REBOUND as problems of the library, and back."""
+"""Simulations of REBOUND as problems of the library, and back; archives as datasets."""
 
+import itertools
+import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike
@@ -7,10 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from ..base.checks import instance
+from ..base.checks import instance, one_of
 from ..base.files import user_file
 from ..base.inputs import refuse_unit_or_mask
+from ..base.keywords import user_level
+from ..base.precision import require_double
 from ..base.printing import printable
+from ..problem.elements import Keplerian
 from ..systems import Problem
 from ..systems.n_body import (
     PARAMETERS,
@@ -46,6 +52,12 @@ _ASTROPY = {
     **{"mearth": "Mearth", "mjupiter": "Mjup", "aus": "au", "parsec": "pc", "gram": "g"},
 }
 """REBOUND's names of units → the usual ones; the others are the same."""
+
+
+# REBOUND 5.2.2 replaces addresses of names one after the other. In the process that wrote the file
+# new addresses may be among the old ones, and a body gets the name of another one. Two readings
+# with different addresses cannot agree on a wrong name.
+_READINGS = 10
 
 
 @printable
@@ -202,6 +214,128 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
         label = {} if name is None else {"name" if isinstance(name, str) else "hash": name}
         simulation.add(m=mass, x=x, y=y, z=z, vx=vx, vy=vy, vz=vz, r=r, **label)
     return simulation
+
+
+def from_archive(archive: Any, *, elements: str | None = None) -> Any:
+    r"""All snapshots of a Simulationarchive of REBOUND as one time series.
+
+    - `archive`: the path of a Simulationarchive, or an open ``rebound.Simulationarchive``.
+    - `elements`: ``"jacobi"`` or ``"heliocentric"`` adds the orbital elements a, e, inc, Omega,
+      omega, M of all bodies but the first, see `dvi.elements`; Jacobi's are relative to the centre
+      of mass of the bodies before them in the order of `body`.
+
+    **Returns** a ``xarray.Dataset`` with the coordinates `time`, `body` and `component`: positions
+    `q` and velocities `v` (time, body, component), masses `m` and radii `r` (time, body), and the
+    number of bodies, `count` (time), in the units of the simulation (attribute ``units``, if it has
+    some). Snapshots between half steps are synchronised.
+
+    A body is identified by its name (REBOUND 4: its hash), those without one by their order; it is
+    NaN while it does not exist. A warning says so if the number of bodies without a name changes:
+    which of them was removed is then not known. Variational particles are left out.
+
+    **Raises** `ValueError` for a file that REBOUND cannot read; `FileNotFoundError` for a path
+    without a file; `ImportError` without rebound, `TypeError` for another object.
+    """
+    rebound, path = require("rebound", "interop.from_archive"), str(archive)
+    import xarray as xr
+
+    one_of("elements", elements, (None, "jacobi", "heliocentric"))
+    try:
+        if isinstance(archive, str | PathLike):
+            archive = rebound.Simulationarchive(str(user_file("archive", archive)))
+        description = "the path of a Simulationarchive, or a rebound.Simulationarchive"
+        instance("archive", archive, rebound.Simulationarchive, description)
+        snapshots = [_snapshot(archive, i) for i in range(len(archive))]
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"REBOUND cannot read the archive {path!r}: {error}") from None
+    columns: dict[Any, int] = {}
+    places = [[columns.setdefault(key, len(columns)) for key in keys] for *_, keys in snapshots]
+    tables = np.full((len(snapshots), len(columns), 8), np.nan)
+    for table, place, (_, rows, _) in zip(tables, places, snapshots, strict=True):
+        table[place] = rows
+    totals = [Counter(name for name, _ in keys) for *_, keys in snapshots]
+    ambiguous = {name for a, b in itertools.pairwise(totals) for name in {*a, *b}
+                 if max(a[name], b[name]) > 1 and a[name] != b[name]}  # fmt: skip
+    if ambiguous:
+        warnings.warn(
+            f"{path}: the number of bodies with the same name ({', '.join(map(str, ambiguous))}) "
+            "changes between snapshots. They are identified by their order, which may be wrong. "
+            "Give the bodies names in REBOUND.",
+            stacklevel=user_level(),
+        )
+    q, v, m, r = tables[..., :3], tables[..., 3:6], tables[..., 6], tables[..., 7]
+    first = archive[0]
+    per_body = {"m": m, "r": r}
+    if elements is not None:
+        require_double("orbital elements")
+        per_body |= _orbits(q, v, m, first.G, elements)
+    axes = ("time", "body", "component")
+    data = xr.Dataset(
+        {"q": (axes, q), "v": (axes, v), **{k: (axes[:2], x) for k, x in per_body.items()}},
+        {
+            "time": [t for t, *_ in snapshots],
+            "body": [str(name) if i == 0 and name is not None else f"{name or 'body'} {column}"
+                     for (name, i), column in columns.items()],
+            "component": list("xyz"),
+        },
+        {"G": first.G, "softening": first.softening, "integrator": str(first.integrator)},
+    )  # fmt: skip
+    data["count"] = "time", [len(keys) for *_, keys in snapshots]
+    if units := _units(first):
+        length, time, mass = (_ASTROPY.get(name, name) for name in units)
+        texts = {"q": length, "v": f"{length}/{time}", "m": mass, "r": length, "time": time}
+        texts |= {"a": length, **dict.fromkeys(Keplerian._fields[2:], "rad")}
+        for name in texts.keys() & data.variables.keys():
+            data[name].attrs["units"] = texts[name]
+    return data
+
+
+def _snapshot(archive: Any, i: int) -> tuple[float, np.ndarray, list[tuple[Any, int]]]:
+    """Time, rows (bodies, 8) of x, v, m, r, and the names, each with its number among equal ones,
+    of a snapshot."""
+    sim = _synchronised(archive, i)
+    alive, readings, names = [sim], [], _names(sim)
+    while any(names) and names not in readings:
+        readings.append(names)
+        alive.append(_synchronised(archive, i))  # so that no address is used again
+        names = _names(alive[-1]) if len(alive) <= _READINGS else [None] * len(names)
+    q, v, m, r = np.empty((sim.N, 3)), np.empty((sim.N, 3)), np.empty(sim.N), np.empty(sim.N)
+    sim.serialize_particle_data(xyz=q, vxvyvz=v, m=m, r=r)
+    number = {name: itertools.count() for name in names}
+    keys = [(name, next(number[name])) for name in names]
+    return sim.t, np.column_stack([q, v, m, r])[: len(names)], keys
+
+
+def _synchronised(archive: Any, i: int) -> Any:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The simulation might not be synchronized")
+        sim = archive[i]
+    sim.synchronize()
+    return sim
+
+
+def _names(sim: Any) -> list[Any]:
+    """Names of the bodies; REBOUND 4 counts variations in N."""
+    return [_name(sim.particles[k]) for k in range(getattr(sim, "N_real", sim.N))]
+
+
+def _orbits(q: Any, v: Any, m: Any, G: float, frame: str) -> dict[str, np.ndarray]:
+    """Elements of the bodies after the first, NaN for the first, each (times, bodies)."""
+    centres, mass = [x[:, :1] for x in (q, v)], m[:, :1] + m[:, 1:]
+    if frame == "jacobi":
+        # Bodies that do not exist have no mass, except the first, without which all is NaN.
+        weights = np.nan_to_num(m)
+        weights[:, :1] = m[:, :1]
+        total = np.cumsum(weights, axis=1)
+        terms = [weights[..., None] * np.where(weights[..., None] > 0, x, 0.0) for x in (q, v)]
+        centres = [np.cumsum(x, axis=1)[:, :-1] / total[:, :-1, None] for x in terms]
+        mass = total[:, 1:]
+    orbits = Keplerian.from_state(q[:, 1:] - centres[0], v[:, 1:] - centres[1], G * mass)
+    pad = ((0, 0), (1, 0))
+    return {
+        name: np.pad(np.asarray(x), pad, constant_values=np.nan)
+        for name, x in zip(Keplerian._fields, orbits, strict=True)
+    }
 
 
 def _check_convertible(sim: Any) -> None:
