@@ -81,6 +81,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         reductions=[memory(r) for r in reductions],
         remainder=task.arithmetic.start(q0, p0),
         stop=stop,
+        counts=jax.tree.map(jnp.zeros_like, _counts(task, interval, q0, p0, q0, p0)),
     )
     in_loop = _in_loop(task, q0)
     if in_loop is None:
@@ -150,6 +151,7 @@ def take_step(
         # Reductions cover the steps before the one in which the run stopped.
         is_end = new.result == RESULTS.stopped
         memories = jax.tree.map(lambda a, b: jnp.where(is_end, b, a), memories, carry.reductions)
+    counts = _counts(task, interval, *ends[2:])
     new = new._replace(
         k=carry.k + 1,
         # The memory of the last good step, for the report: that of a failed one may be NaN.
@@ -159,8 +161,17 @@ def take_step(
         reductions=memories,
         remainder=remainder,
         stop=stop,
+        counts={
+            name: jnp.where(good, total + counts[name], total)
+            for name, total in carry.counts.items()
+        },
     )
     return new, interval, ends
+
+
+def _counts(task: Task, interval: Interval, *states: State) -> dict[str, Array]:
+    """The numbers that the method reports of a step, without a derivative."""
+    return task.method.count(task.equations, interval, *lax.stop_gradient(states))
 
 
 def _with_failure(
