@@ -67,6 +67,7 @@ def as_solution(
         "max_residual": relative_size(*carry.residual),
         "failed_step": carry.failed_step,
         "failed_residual": relative_size(*carry.failed_residual),
+        **carry.counts,
         **task.lattice.report(carry.lattice, task.equations, place),
         **({} if defect is None else {"round_trip_defect": defect}),
     }

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ..base.checks import instance
 from ..base.types import Args, Interval, State
@@ -79,6 +80,10 @@ class Method(eqx.Module):
     ) -> "Coordinates | None":
         """The same for steps of one length, without what two neighbours undo."""
         return self.in_coordinates(equations, interval, q)
+
+    def count(self, equations: Equations, interval: Interval, *states: State) -> dict[str, Array]:
+        """Integers for a step (q0, p0, q1, p1), whose sums are in ``solution.stats``."""
+        return {}
 
     def check(
         self, equations: Equations, first_interval: Callable[[], Interval], q: State, p: State

@@ -134,10 +134,11 @@ class SplittingMethod(Method):
         return sequence_of(self.scheme, len(self.parts(equations, interval, q)))
 
     def compose(
-        self, equations: Equations, interval: Interval, q: State, p: State, stages: list[Stage]
-    ) -> StateAndInfo:
-        """One flow after another."""
-        parts = self.parts(equations, interval, q)
+        self, equations: Equations, interval: Interval, q: State, p: State, stages: list[Stage],
+        parts: list[PartFlow] | None = None,
+    ) -> StateAndInfo:  # fmt: skip
+        """One flow after another, by default of the `parts` of the method."""
+        parts = self.parts(equations, interval, q) if parts is None else parts
 
         def advance_all(state, pieces, numbers):
             q, p, info = state

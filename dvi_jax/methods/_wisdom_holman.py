@@ -7,17 +7,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jax import lax
+from jaxtyping import Array, Bool
 
+import lanewise
 from lanewise.jaxprs.dependence import depends_on
 
-from ..base.checks import array, one_of, whole
+from ..base.checks import array, one_of, positive, whole
 from ..base.keywords import user_level
 from ..base.types import Args, Interval, State
 from ..engine.newton import find_root
 from ..problem import kepler as _kepler
 from ..problem.flows import value_of
 from ..problem.frames import Democratic, Jacobi
+from ._encounters import Encounters
 from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, join_neighbours
 from ._splitting import PartFlow, SplittingMethod, Stage
 from ._strang import Strang
@@ -25,6 +28,9 @@ from .step import Equations, judge, no_solve, no_step_yet
 
 _FEWEST = 10
 """Evaluations of the interaction in a revolution, below which a run warns."""
+
+_ATTEMPTS = 4
+"""Of a step whose end has further pairs of bodies that are close."""
 
 Coordinates = Literal["jacobi", "democratic"]
 
@@ -79,6 +85,7 @@ class WisdomHolman(SplittingMethod):
     corrector: int = eqx.field(static=True, default=0)
     scheme: Any = eqx.field(static=True, default_factory=Strang, converter=as_scheme)
     G: Any = None
+    encounters: float | None = eqx.field(static=True, default=None)
 
     has_coordinates: ClassVar[bool] = True
 
@@ -92,6 +99,10 @@ class WisdomHolman(SplittingMethod):
                 f"corrector={self.corrector}, coordinates={self.coordinates!r}, "
                 f"scheme={self.scheme!r}."
             )
+
+        if self.encounters is not None:
+            positive("encounters", self.encounters)
+            one_of('coordinates of a method with encounters', self.coordinates, ("democratic",))
 
     def is_double_only(self, equations) -> bool:
         return True
@@ -175,7 +186,8 @@ class WisdomHolman(SplittingMethod):
         """The gravitational constant."""
         return value_of(_gravity if self.G is None else self.G, equations.args, q)
 
-    def parts(self, equations, interval, q):
+    def parts(self, equations, interval, q, close=None):
+        """The parts; with `close`, pairs of bodies, their attraction is in the first one."""
         frame, scale = self._frame(equations, interval, q)
         mu = self._strength(equations, q) * frame.central_mass()
         # With an origin states are relative to it, in these coordinates too: they are linear.
@@ -183,6 +195,7 @@ class WisdomHolman(SplittingMethod):
         position, momentum = equations.absolute(zero, zero)
         base = frame.from_bodies(position), frame.velocities_of(momentum / scale)
         implicit = not equations.step_is_explicit(interval, q)
+        bodies = self._bodies(equations, interval, q) if close is not None else None
 
         def attraction(X):
             """The accelerations of the Kepler part."""
@@ -195,6 +208,16 @@ class WisdomHolman(SplittingMethod):
             h = interval.h
             full_X, full_V = base[0] + X, base[1] + V
             dX, dV, is_root = _kepler.change(h, full_X[1:], full_V[1:], mu)
+            if close is not None:
+
+                def meet():
+                    *motion, is_found = bodies.motion(h, full_X[1:], full_V[1:], close)
+                    is_member = jnp.any(close, axis=1)[:, None]
+                    new = (jnp.where(is_member, *pair) for pair in zip(motion, (dX, dV)))
+                    return *new, is_root & is_found
+
+                is_any = lanewise.on_any(jnp.any(close))
+                dX, dV, is_root = lax.cond(is_any, meet, lambda: (dX, dV, is_root))
             X1 = X + jnp.concatenate([h * full_V[:1], dX])
             V1 = V + jnp.concatenate([jnp.zeros_like(V[:1]), dV])
             return X1, V1, judge(no_solve(X)._replace(converged=is_root), X1, V1)
@@ -205,6 +228,13 @@ class WisdomHolman(SplittingMethod):
             def rate(V):
                 p = scale * frame.velocities_back(V)
                 acceleration = equations.momentum_rate(interval, x, p) / scale
+                if close is not None:
+                    full_x = (position + x)[1:]
+                    is_any = lanewise.on_any(jnp.any(close))
+                    pull = lax.cond(
+                        is_any, lambda: bodies.pull(full_x, close), lambda: jnp.zeros_like(full_x)
+                    )
+                    acceleration = acceleration.at[1:].add(-pull)
                 return frame.velocities_of(acceleration) - attraction(base[0] + X)
 
             if not implicit:
@@ -226,8 +256,62 @@ class WisdomHolman(SplittingMethod):
 
         return [PartFlow(kepler, True), PartFlow(interaction, not implicit)]
 
+    def _bodies(self, equations: Equations, interval: Interval, q: State) -> Encounters:
+        frame, _ = self._frame(equations, interval, q)
+        mu = self._strength(equations, q) * frame.central_mass()
+        m = frame.masses[1:] / frame.masses[0]
+        # Radii decide only. At the mass 0 they have no derivative.
+        radii = self.encounters * jnp.cbrt(lax.stop_gradient(m) / 3)
+        softening = equations.args.get("softening", 0.0) if isinstance(equations.args, dict) else 0
+        return Encounters(m * mu, mu, radii, jnp.asarray(softening, q.dtype) ** 2)
+
+    def _close(self, equations: Equations, interval: Interval, q: State, p: State) -> Bool[Array, "n n"]:
+        """The pairs of bodies that are close at a state in these coordinates."""
+        frame, scale = self._frame(equations, interval, q)
+        zero = jnp.zeros_like(q)
+        position, momentum = equations.absolute(zero, zero)
+        X, V = q + frame.from_bodies(position), p + frame.velocities_of(momentum / scale)
+        bodies = self._bodies(equations, interval, q)
+        return lax.stop_gradient(bodies).close(interval.h, *lax.stop_gradient((X[1:], V[1:])))
+
+    def compose(self, equations, interval, q, p, stages, parts=None):
+        if self.encounters is None:
+            return super().compose(equations, interval, q, p, stages, parts)
+
+        def attempt(state):
+            close, *_ = state
+            parts = self.parts(equations, interval, q, close)
+            q1, p1, info = super(WisdomHolman, self).compose(
+                equations, interval, q, p, stages, parts
+            )
+            new = close | self._close(equations, interval, q1, p1)
+            return new, jnp.all(new == close), q1, p1, info
+
+        def repeat(state, _):
+            is_final = state[1]
+
+            def again():
+                return jax.tree.map(lambda a, b: jnp.where(is_final, a, b), state, attempt(state))
+
+            return lax.cond(lanewise.on_any(~is_final, rare=False), again, lambda: state), None
+
+        # Pairs are judged at both ends. A pair that is close at the end only is one of the step,
+        # which is repeated from its start.
+        close = self._close(equations, interval, q, p)
+        start = close, jnp.asarray(False), q, p, no_step_yet(q)
+        (_, is_final, q, p, info), _ = lax.scan(repeat, start, None, _ATTEMPTS)
+        return q, p, info
+
+    def count(self, equations, interval, *states):
+        if self.encounters is None:
+            return {}
+        q0, p0, q1, p1 = states
+        ends = (self.enter(equations, interval, *state)[:2] for state in ((q0, p0), (q1, p1)))
+        is_close = [jnp.any(self._close(equations, interval, *state)) for state in ends]
+        return {"encounter_steps": (is_close[0] | is_close[1]).astype(jnp.int32)}
+
     def in_loop(self, equations, interval, q):
-        is_fixed = self._is_fixed(equations, interval, q)
+        is_fixed = self._is_fixed(equations, interval, q) and self.encounters is None
         return super().in_loop(equations, interval, q) if is_fixed else None
 
     def in_coordinates(self, equations, interval, q):

@@ -1,0 +1,177 @@
+r"""Close encounters of N bodies: which pairs of bodies meet in a step, and the motion of these.
+
+In democratic coordinates the pair (i, j) is moved from the part B to the part A of the Hamiltonian,
+
+    H_A = Σ |P_i|²/(2 m_i) − μ m_i/|Q_i|  −  Σ_close G m_i m_j/|Q_i − Q_j| .
+
+The pairs are chosen once for a step, so that it is one of a symmetric splitting.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool
+
+import lanewise
+
+from ..base.types import Scalar
+
+_SUBSTEPS = np.arange(1.0, 7.0)
+"""Numbers of steps of the leapfrog whose extrapolation to infinitely many has the order 12."""
+
+_TOLERANCE = 256
+"""Largest estimate of the error of a substep, in roundings of the distance and of the change of
+velocity in it. The estimate is of order 10, the error much smaller."""
+
+_MOST = 10_000
+"""Substeps in one motion of the part A, after which the status is `not_converged`."""
+
+
+def _extrapolation(n: np.ndarray) -> np.ndarray:
+    """The weights of results with n steps, whose errors are series in 1/n²."""
+    s = n * n
+    others = ~np.eye(len(n), dtype=bool)
+    return np.where(others, s[:, None] / np.where(others, s[:, None] - s, 1), 1).prod(axis=1)
+
+
+_WEIGHTS = _extrapolation(_SUBSTEPS)
+_OF_ERROR = _WEIGHTS - np.append(0.0, _extrapolation(_SUBSTEPS[1:]))
+
+
+class Encounters(NamedTuple):
+    """The bodies around the first one: their `masses` times G, μ of their Kepler orbits, the
+    distances below which a pair is close, in units of the distance to the first body, and the
+    square of the softening."""
+
+    masses: Array
+    mu: Array
+    radii: Array
+    softening: Scalar
+
+    def close(self, h: Scalar, X: Array, V: Array) -> Bool[Array, "n n"]:
+        """The pairs that are close along straight lines during a time h before and after."""
+        radius = self.radii * _length(X)
+        x, v = _pairs(X), _pairs(V)
+        v2 = jnp.sum(v * v, axis=-1)
+        # The same for (h, V) and (−h, −V): judged at both ends, a step back has the same pairs.
+        time = jnp.minimum(jnp.abs(jnp.sum(x * v, axis=-1)) / jnp.where(v2 > 0, v2, 1), jnp.abs(h))
+        sign = jnp.where(jnp.sum(x * v, axis=-1) > 0, -1.0, 1.0).astype(time.dtype)
+        nearest = x + (sign * time)[..., None] * v
+        near = _length(nearest) < jnp.maximum(radius[:, None], radius[None])
+        return near & ~jnp.eye(len(X), dtype=bool)
+
+    def pull(self, x: Array, close: Array) -> Array:
+        """The accelerations by the attraction of close pairs."""
+        difference = _pairs(x)
+        square = jnp.sum(difference * difference, axis=-1) + self.softening
+        square = jnp.where(close, square, 1)
+        weight = jnp.where(close, -self.masses[None] / (square * jnp.sqrt(square)), 0)
+        return jnp.sum(weight[..., None] * difference, axis=1)
+
+    def motion(self, h: Scalar, X: Array, V: Array, close: Array) -> tuple[Array, Array, Array]:
+        """The changes of X and V of the bodies in close pairs, in the part A over the time h, and
+        whether they were found; 0 for other bodies."""
+        dX, dV, left = _differentiable(_motion, [*self, h, X, V, close])
+        return dX, dV, left == 0
+
+
+def _motion(*operands: Array) -> list[Array]:
+    """The changes, and the time that is left, by Gragg, Bulirsch and Stoer's extrapolation of the leapfrog."""
+    *constants, h, X, V, close = operands
+    bodies = Encounters(*constants)
+    is_member = jnp.any(close, axis=1)[:, None]
+    V = jnp.where(is_member, V, 0)
+    rows = tuple(jnp.asarray(x, X.dtype) for x in (_SUBSTEPS, _WEIGHTS, _OF_ERROR))
+    tolerance = _TOLERANCE * float(jnp.finfo(X.dtype).eps)
+
+    def acceleration(X):
+        r = _length(X)[:, None]
+        a = bodies.pull(X, close) - bodies.mu[:, None] / (r * r * r) * X
+        return jnp.where(is_member, a, 0)
+
+    def leapfrog(n, step, x, v, a0):
+        """The changes after n steps; the velocity is half a step ahead in between."""
+
+        def advance(state):
+            i, dx, dv, _ = state
+            dx = dx + step * (v + dv)
+            kick = step * acceleration(x + dx)
+            return i + 1, dx, dv + kick, kick
+
+        start = jnp.zeros_like(n), jnp.zeros_like(x), step / 2 * a0, jnp.zeros_like(x)
+        _, dx, dv, kick = lax.while_loop(lambda state: state[0] < n, advance, start)
+        return jnp.stack([dx, dv - kick / 2])
+
+    def attempt(state):
+        t, step, dX, dV, _, count = state
+        step = jnp.where(jnp.abs(step) < jnp.abs(h - t), step, h - t)
+        x, v = X + dX, V + dV
+        a = acceleration(x)
+
+        def add(sums, row):
+            n, weight, of_error = row
+            change = leapfrog(n, step / n, x, v, a)
+            return (sums[0] + weight * change, sums[1] + of_error * change), None
+
+        zero = jnp.zeros((2, *x.shape), x.dtype)
+        (change, error), _ = lax.scan(add, (zero, zero), rows)
+        scale = _size(jnp.stack([v, a])) * jnp.abs(step) + _size(change)
+        error = jnp.max(_size(error) / jnp.where(scale > 0, scale, 1))
+        is_good = error <= tolerance
+        ratio = tolerance / jnp.maximum(error, tolerance / 4.0**11)
+        factor = jnp.clip(0.9 * ratio ** (1 / 11), 0.1, 4.0)
+        take = jnp.where(is_good, change, 0)
+        # The last substep ends at h, also where the sum of the substeps is not h.
+        t = jnp.where(is_good, jnp.where(step == h - t, h, t + step), t)
+        # The substeps are no functions of the state for derivatives: those of the flow do not
+        # depend on them.
+        step = lax.stop_gradient(step * factor)
+        return t, step, dX + take[0], dV + take[1], jnp.isfinite(error), count + 1
+
+    def proceed(state):
+        t, _, _, _, is_finite, count = state
+        return (t != h) & is_finite & (count < _MOST)
+
+    zero, count = jnp.zeros_like(X), jnp.asarray(0, jnp.int32)
+    start = jnp.zeros_like(h), h, zero, zero, jnp.asarray(True), count
+    t, _, dX, dV, _, _ = lax.while_loop(proceed, attempt, start)
+    return [dX, dV, lax.stop_gradient(h - t)]
+
+
+def _pairs(x: Array) -> Array:
+    return x[:, None] - x[None]
+
+
+def _length(x: Array) -> Array:
+    """|x| along the last axis, where it is 0 with the derivative 0."""
+    square = jnp.sum(x * x, axis=-1)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def _size(x: Array) -> Array:
+    return jnp.max(jnp.abs(x), axis=-1)
+
+
+def _differentiable(function: Callable, operands: Sequence[Any]) -> list[Array]:
+    """The list of arrays ``function(*operands)`` with the derivatives of its forward mode, of every
+    order, also in reverse mode, which a loop of unknown length does not have."""
+
+    def rule(operands, changes):
+        places = tuple(i for i in changes if jnp.issubdtype(operands[i].dtype, jnp.inexact))
+
+        def jacobians(*operands):
+            return jax.tree.leaves(jax.jacfwd(function, argnums=places)(*operands))
+
+        # In the order of the results, and for each in that of the places.
+        matrices = iter(_differentiable(jacobians, operands))
+        count = len(jax.eval_shape(function, *operands))
+        return [
+            sum(jnp.tensordot(next(matrices), changes[i], changes[i].ndim) for i in places)
+            for _ in range(count)
+        ]
+
+    return lanewise.with_derivative(function, rule, operands)
