@@ -205,7 +205,6 @@ class Carry(NamedTuple):
     reductions: list[Any]
     remainder: Any = None  # what the arithmetic stores next to q and p
     stop: Any = None  # with a `Stop`: the last step, as a row, and its number
-    stop: Any = None  # with a `Stop`: the last step, as a row
     counts: Any = None  # the sums of `Method.count`
     method_state: Any = None  # of a method with an `InLoop`: the state in its own coordinates
     jumps: Any = None  # with a `Jump`: a `JumpMemory`
