@@ -215,28 +215,28 @@ def joined(arc: Observations) -> Observations:
         return arc
     t0, kinds = arc.t0, tuple(kind.ordered(t0=arc.t0) for kind in arc.events)
     ts = np.unique(np.concatenate([arc.ts, *(kind.times for kind in kinds)]))
-    n, k = len(ts), arc.components
-    values, errors = np.full((2, n, k + len(kinds)), np.nan)
-    rows, period = np.full((n, len(kinds), 3), np.nan), np.full(k + len(kinds), np.inf)
+    count, width = len(ts), arc.components
+    values, errors = np.full((2, count, width + len(kinds)), np.nan)
+    rows, period = np.full((count, len(kinds), 3), np.nan), np.full(width + len(kinds), np.inf)
     place = np.searchsorted(ts, arc.ts)
-    values[place, :k] = arc.values.reshape(len(place), k)
-    errors[place, :k] = arc.errors.reshape(len(place), k)
+    values[place, :width] = arc.values.reshape(len(place), width)
+    errors[place, :width] = arc.errors.reshape(len(place), width)
     for i, kind in enumerate(kinds):
         moment = np.searchsorted(ts, kind.times)
-        values[moment, k + i] = kind.times
-        errors[moment, k + i] = np.nan if kind.sigma is None else kind.sigma
+        values[moment, width + i] = kind.times
+        errors[moment, width + i] = np.nan if kind.sigma is None else kind.sigma
         rows[moment, i] = kind.rows(t0)
     fields: dict[str, Any] = {"sigma": errors if arc.has_errors else None}
     if arc.covariance is not None:
-        C = np.eye(k + len(kinds)) * np.where(np.isnan(errors), 1.0, errors)[:, None] ** 2
-        C[place, :k, :k] = arc.covariance
-        fields = {"covariance": C}
+        full = np.eye(width + len(kinds)) * np.where(np.isnan(errors), 1.0, errors)[:, None] ** 2
+        full[place, :width, :width] = arc.covariance
+        fields = {"covariance": full}
     if arc.period is not None:
-        period[:k] = arc.period.ravel()
+        period[:width] = arc.period.ravel()
         fields["period"] = period
-    ends = [kind.end(t0) for kind in kinds] + [arc.ts[i] for i in (0, -1) if k]
+    ends = [kind.end(t0) for kind in kinds] + [arc.ts[i] for i in (0, -1) if width]
     fields |= {"reach": max(ends, key=lambda t: abs(t - t0)), "kinds": kinds, "rows": rows}
-    shape = arc.values.shape[1:] if k else None
+    shape = arc.values.shape[1:] if width else None
     return JoinedObservations(ts, values, arc.observe, t0=t0, plain_shape=shape, **fields)
 
 

@@ -1,9 +1,10 @@
 """Simulations of REBOUND as problems of the library, and back; archives as datasets."""
 
+import contextlib
 import itertools
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike
 from typing import Any
@@ -113,13 +114,9 @@ def from_rebound(simulation: Any, *, snapshot: int = -1) -> ReboundProblem:
     rebound = require("rebound", "interop.from_rebound")
     if isinstance(simulation, str | PathLike):
         simulation = user_file("simulation", simulation)
-        try:
+        subject = f"snapshot {snapshot} of {str(simulation)!r} (0: the first, −1: the last)"
+        with _reading(subject):
             simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
-        except (RuntimeError, ValueError) as error:
-            raise ValueError(
-                f"REBOUND cannot read snapshot {snapshot} of {str(simulation)!r} (0: the first, "
-                f"−1: the last): {error}"
-            ) from None
         simulation.synchronize()  # a snapshot may have been taken between half steps
     elif snapshot != -1 and isinstance(simulation, rebound.Simulation):
         raise ValueError(
@@ -240,22 +237,24 @@ def from_archive(archive: Any, *, elements: str | None = None) -> Any:
     import xarray as xr
 
     one_of("elements", elements, (None, "jacobi", "heliocentric"))
-    try:
+    with _reading(f"the archive {path!r}"):
         if isinstance(archive, str | PathLike):
             archive = rebound.Simulationarchive(str(user_file("archive", archive)))
         description = "the path of a Simulationarchive, or a rebound.Simulationarchive"
         instance("archive", archive, rebound.Simulationarchive, description)
         snapshots = [_snapshot(archive, i) for i in range(len(archive))]
-    except (RuntimeError, ValueError) as error:
-        raise ValueError(f"REBOUND cannot read the archive {path!r}: {error}") from None
     columns: dict[Any, int] = {}
     places = [[columns.setdefault(key, len(columns)) for key in keys] for *_, keys in snapshots]
     tables = np.full((len(snapshots), len(columns), 8), np.nan)
     for table, place, (_, rows, _) in zip(tables, places, snapshots, strict=True):
         table[place] = rows
     totals = [Counter(name for name, _ in keys) for *_, keys in snapshots]
-    ambiguous = {name for a, b in itertools.pairwise(totals) for name in {*a, *b}
-                 if max(a[name], b[name]) > 1 and a[name] != b[name]}  # fmt: skip
+    ambiguous = {
+        name
+        for earlier, later in itertools.pairwise(totals)
+        for name in {*earlier, *later}
+        if earlier[name] != later[name] and max(earlier[name], later[name]) > 1
+    }
     if ambiguous:
         warnings.warn(
             f"{path}: the number of bodies with the same name ({', '.join(map(str, ambiguous))}) "
@@ -263,19 +262,18 @@ def from_archive(archive: Any, *, elements: str | None = None) -> Any:
             "Give the bodies names in REBOUND.",
             stacklevel=user_level(),
         )
-    q, v, m, r = tables[..., :3], tables[..., 3:6], tables[..., 6], tables[..., 7]
-    first = archive[0]
-    per_body = {"m": m, "r": r}
+    q, v, first = tables[..., :3], tables[..., 3:6], archive[0]
+    variables = {"q": q, "v": v, "m": tables[..., 6], "r": tables[..., 7]}
     if elements is not None:
         require_double("orbital elements")
-        per_body |= _orbits(q, v, m, first.G, elements)
+        variables |= _orbits(q, v, tables[..., 6], first.G, elements)
     axes = ("time", "body", "component")
     data = xr.Dataset(
-        {"q": (axes, q), "v": (axes, v), **{k: (axes[:2], x) for k, x in per_body.items()}},
+        {name: (axes[: values.ndim], values) for name, values in variables.items()},
         {
-            "time": [t for t, *_ in snapshots],
-            "body": [str(name) if i == 0 and name is not None else f"{name or 'body'} {column}"
-                     for (name, i), column in columns.items()],
+            "time": [moment for moment, *_ in snapshots],
+            "body": [f"{name or 'body'} {column}" if number or name is None else str(name)
+                     for (name, number), column in columns.items()],
             "component": list("xyz"),
         },
         {"G": first.G, "softening": first.softening, "integrator": str(first.integrator)},
@@ -299,11 +297,12 @@ def _snapshot(archive: Any, i: int) -> tuple[float, np.ndarray, list[tuple[Any, 
         readings.append(names)
         alive.append(_synchronised(archive, i))  # so that no address is used again
         names = _names(alive[-1]) if len(alive) <= _READINGS else [None] * len(names)
-    q, v, m, r = np.empty((sim.N, 3)), np.empty((sim.N, 3)), np.empty(sim.N), np.empty(sim.N)
-    sim.serialize_particle_data(xyz=q, vxvyvz=v, m=m, r=r)
+    shapes = {"xyz": (sim.N, 3), "vxvyvz": (sim.N, 3), "m": sim.N, "r": sim.N}
+    fields_of_bodies = {name: np.empty(shape) for name, shape in shapes.items()}
+    sim.serialize_particle_data(**fields_of_bodies)
     number = {name: itertools.count() for name in names}
     keys = [(name, next(number[name])) for name in names]
-    return sim.t, np.column_stack([q, v, m, r])[: len(names)], keys
+    return sim.t, np.column_stack([*fields_of_bodies.values()])[: len(names)], keys
 
 
 def _synchronised(archive: Any, i: int) -> Any:
@@ -319,13 +318,13 @@ def _names(sim: Any) -> list[Any]:
     return [_name(sim.particles[k]) for k in range(getattr(sim, "N_real", sim.N))]
 
 
-def _orbits(q: Any, v: Any, m: Any, G: float, frame: str) -> dict[str, np.ndarray]:
+def _orbits(q: Any, v: Any, masses: Any, G: float, frame: str) -> dict[str, np.ndarray]:
     """Elements of the bodies after the first, NaN for the first, each (times, bodies)."""
-    centres, mass = [x[:, :1] for x in (q, v)], m[:, :1] + m[:, 1:]
+    centres, mass = [x[:, :1] for x in (q, v)], masses[:, :1] + masses[:, 1:]
     if frame == "jacobi":
         # Bodies that do not exist have no mass, except the first, without which all is NaN.
-        weights = np.nan_to_num(m)
-        weights[:, :1] = m[:, :1]
+        weights = np.nan_to_num(masses)
+        weights[:, :1] = masses[:, :1]
         total = np.cumsum(weights, axis=1)
         terms = [weights[..., None] * np.where(weights[..., None] > 0, x, 0.0) for x in (q, v)]
         centres = [np.cumsum(x, axis=1)[:, :-1] / total[:, :-1, None] for x in terms]
@@ -336,6 +335,14 @@ def _orbits(q: Any, v: Any, m: Any, G: float, frame: str) -> dict[str, np.ndarra
         name: np.pad(np.asarray(x), pad, constant_values=np.nan)
         for name, x in zip(Keplerian._fields, orbits, strict=True)
     }
+
+
+@contextlib.contextmanager
+def _reading(subject: str) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"REBOUND cannot read {subject}: {error}") from None
 
 
 def _check_convertible(sim: Any) -> None:
