@@ -461,3 +461,18 @@ def test_a_solution_with_jumps_in_a_file(tmp_path):
     same = dvi.Solution.load(tmp_path / "run.npz")
     for x, y in zip(*map(jax.tree.leaves, (sol.jumps, same.jumps)), strict=True):
         np.testing.assert_array_equal(x, y)
+
+
+@slow
+def test_single_precision_and_arrays_and_pieces():
+    """A state in float32, XLA's loops, a run with progress reports."""
+    sol = drop(0.8)
+    ball = jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32)
+    single = run(BALL, *ball, args=0.8, jump=FLOOR)
+    assert single.jumps.qs_after.dtype == single.qs.dtype == jnp.float32
+    np.testing.assert_allclose(single.jumps.ts[:2], bounces(0.8, 2)[0], rtol=1e-6)
+    arrays = drop(0.8, layout=dvi.Layout(form="arrays"))
+    np.testing.assert_allclose(arrays.qs, sol.qs, atol=1e-14)
+    pieces = drop(0.8, progress=lambda *steps: None)
+    for x, y in zip(*map(jax.tree.leaves, (sol.jumps, pieces.jumps)), strict=True):
+        np.testing.assert_array_equal(x, y)

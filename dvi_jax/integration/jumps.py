@@ -164,8 +164,9 @@ def jumps_of(memory: JumpMemory, q: State) -> Jumps:
     return Jumps(rows[:, 0], index, q0, p0, q1, p1, memory.number)
 
 
-def _quiet(like: State) -> float:
-    return float(jnp.finfo(like.dtype).eps) ** 0.4
+def _quiet(like: State) -> Scalar:
+    """The fraction of a step for which g is ignored after a jump."""
+    return jnp.asarray(jnp.finfo(like.dtype).eps ** 0.4, like.dtype)
 
 
 def _values(task: Task, equations: Equations, *point: Any) -> Numbers:

@@ -30,8 +30,7 @@ class Jump(eqx.Module):
       surfaces that may be passed: a kick at a time t_k, g = t − t_k; a change of a stage. The next
       jump then requires g < 0 in between.
     - `max_jumps`: the largest number of jumps that is stored in ``solution.jumps``, see `Jumps`;
-      of a list of `Jump` the sum. It is static. A step takes longer for larger numbers; with 0
-      the jumps are only counted.
+      of a list of `Jump` the sum. It is static. With 0 the jumps are only counted.
 
     Derivatives contain the change of the time of the jump (saltation), also those of `Lyapunov`
     exponents and other deviation vectors. `Reversible` works as `Checkpointed`.
