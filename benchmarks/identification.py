@@ -4,7 +4,7 @@
 
 The equations, initial states, times and libraries are those of pysindy's examples and utilities.
 Both packages receive the same noisy values, without their errors, and the same monomials; of the
-5000 times of the Lorenz equations `identify` receives every fifth, which takes less time.
+2000 times of the Lorenz equations `identify` receives every fifth, which takes less time.
 
 - `default`: pysindy as its first example uses it, finite differences and a threshold of 0.1.
 - `best`: the best of pysindy with smoothed or plain differences and seven thresholds. It is chosen
@@ -65,9 +65,9 @@ CASES = {
     "Van der Pol": Case("van_der_pol", OSCILLATOR, (2.0, 0.0), 20, 0.05, 0.05, 3),
     "Duffing": Case("duffing", DUFFING, (2.0, 0.0), 20, 0.05, 0.05, 3),
     "Lotka–Volterra": Case("lotka", PREDATOR, (0.5, 0.1), 10, 0.02, 0.01, 2),
-    "Lorenz": Case("lorenz", LORENZ, (-8.0, 8.0, 27.0), 10, 0.002, 0.0, 2, 25, 5),
-    "Lorenz, noise 0.1": Case("lorenz", LORENZ, (-8.0, 8.0, 27.0), 10, 0.002, 0.1, 2, 25, 5),
-    "Lorenz, noise 0.5": Case("lorenz", LORENZ, (-8.0, 8.0, 27.0), 10, 0.002, 0.5, 2, 25, 5),
+    "Lorenz": Case("lorenz", LORENZ, (-8.0, 8.0, 27.0), 4, 0.002, 0.0, 2, 10, 5),
+    "Lorenz, noise 0.1": Case("lorenz", LORENZ, (-8.0, 8.0, 27.0), 4, 0.002, 0.1, 2, 10, 5),
+    "Lorenz, noise 0.5": Case("lorenz", LORENZ, (-8.0, 8.0, 27.0), 4, 0.002, 0.5, 2, 10, 5),
 }
 
 
