@@ -1,6 +1,8 @@
 """Equations x' = f(x) identified from data: their terms, standard errors, and what is missing."""
 
 import functools
+import importlib
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -157,16 +159,16 @@ def test_exactly_the_planted_terms(name):
 
 
 @pytest.mark.slow
-def test_lorenz_over_nine_lyapunov_times():
-    """Multiple shooting: the trajectory of a wrong guess is of no use after two units of time."""
-    ts = np.arange(0.0, 10.0, 0.02)
+def test_lorenz_by_multiple_shooting():
+    """Over 3.6 Lyapunov times, after which the trajectory of a wrong guess is of no use."""
+    ts = np.arange(0.0, 4.0, 0.02)
     data = observed(lorenz, (-8.0, 8.0, 27.0), ts, 0.1, 0)
     library = dvi.ForceLibrary.monomials(2, 3, "x", constant=True)
-    segments = dvi.MultipleShooting(25)
+    segments = dvi.MultipleShooting(10)
     found = dvi.identify(dvi.Model.first_order(h=0.01), data, library, shooting=segments)
     assert set(found.terms) == set(LORENZ)
     assert np.abs(deviations(found, LORENZ)).max() < 4
-    assert np.max(found.sigma / np.abs(found.coefficients)) < 0.005
+    assert np.max(found.sigma / np.abs(found.coefficients)) < 0.02
     assert found.fit.status == "converged"
 
 
@@ -219,6 +221,22 @@ def test_samples_of_the_posterior_have_the_errors_of_the_fit():
     np.testing.assert_allclose(samples.sigma / fit.sigma, 1.0, atol=0.2)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Van der Pol", "Lotka–Volterra"])
+def test_a_comparison_with_pysindy(name, monkeypatch):
+    """A row of the table of docs/equations.md: no row of `identify` has a wrong term."""
+    pytest.importorskip("pysindy")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    identification = importlib.import_module("identification")
+    case = identification.CASES[name]
+    scores = identification.compare(case, 0)
+    missing, surplus, error = scores["identify"]
+    assert (missing, surplus) == (0, 0)
+    assert error < 0.5 * scores["best"][2]
+    assert error < 0.5 * scores["default"][2]
+    assert np.abs(deviations(scores["found"], case.terms)).max() < 4
+
+
 TS, VALUES = [0.1, 0.2, 0.3, 0.4], np.ones((4, 2))
 OF_P = dvi.ForceLibrary.monomials(1, 2)
 WRONG_SHAPE = dvi.ForceLibrary({"f": lambda t0, t1, x, p, args: x[:1]})
@@ -233,8 +251,9 @@ INVALID = [
     (lambda: run(params={"epsilon": 1.0}), ValueError, "epsilon"),
     (lambda: run(observe="state"), TypeError, "q0 is missing"),
     (lambda: run(values=[[np.nan, 1.0], *VALUES[1:]]), TypeError, "q0 is missing"),
-    (lambda: run(params={"q0": [1.0, 1.0, 1.0]}), ValueError, "shape"),
-    (lambda: run(model=dvi.Model.first_order(h=0.1, q0=[1.0])), ValueError, "shape"),
+    (lambda: run(params={"q0": np.ones(3)}), ValueError, r"q0 for .* must have shape \(2,\)"),
+    (lambda: run(model=dvi.Model.first_order(h=0.1, q0=[1.0])), ValueError, r"q0 for .* shape \(2"),
+    (lambda: run(values=np.ones((4, 3))), ValueError, r"q0 for .* must have shape \(2,\)"),
     (lambda: run(ts=[0.1], values=VALUES[:1]), ValueError, "observed values"),
 ]
 

@@ -168,13 +168,13 @@ def identify(
     _check_input(library, params, bounds, priors, loss, penalty)
     full_model = _with_library(model, library, is_list, params)
     zeros = {**params, KEY: dict.fromkeys(library.names, 0.0)}
-    starts = [zeros]
-    if field_of(full_model.base_specification(params, 0)["system"]):
-        starts.insert(0, {**params, KEY: by_regression(full_model, library, arcs, params)})
     arcs_with_errors = [_with_errors(arc) for arc in arcs]
     full_problem = full_model, arcs_with_errors, is_list
     unguarded = FitProblem(*full_problem, zeros, bounds=bounds, loss=loss)
     enough_values(unguarded.count, unguarded.size, f"{unguarded.size} candidates and parameters")
+    starts = [zeros]
+    if field_of(full_model.base_specification(params, 0)["system"]):
+        starts.insert(0, {**params, KEY: by_regression(full_model, library, arcs, params)})
     common: dict[str, Any] = {name: x for name, x in settings.items() if name in _OF_ALL}
     observations = arcs_with_errors if is_list else arcs_with_errors[0]
 
