@@ -514,3 +514,87 @@ def test_conserved_quantities_of_the_relativity_of_all_bodies():
     change = np.abs(computed - computed[:, :1]).max(axis=1)
     slow, fast = np.stack([change[:, 0], change[:, 1], *change[:, 2:].reshape(2, 2, 3).max(2).T]).T
     np.testing.assert_allclose(np.log2(slow / fast), [2, 4, 2, 4], atol=0.3)
+
+
+def test_parameters_of_a_force_in_the_problem(state):
+    """`add_to` stores them next to those of the problem, so that nothing else has to name them."""
+    nb = systems.n_body(MASSES, *state, G=ARGS["G"])
+    problem = forces.Relativity(lambda args: args["c"]).add_to(nb, args={"c": LIGHT})
+    assert problem.args == {**nb.args, "c": LIGHT}
+    assert "c" not in nb.args
+    run = {"num_steps": 2, "method": dvi.GaussLegendre(2)}
+    fixed = dvi.integrate(EVERY["relativity"].add_to(nb), **run)
+    np.testing.assert_allclose(dvi.integrate(problem, **run).qs, fixed.qs, rtol=1e-14)
+    with pytest.raises(TypeError, match="args must be a dict of parameters"):
+        EVERY["relativity"].add_to(nb, args=3.0)
+
+
+def test_forces_and_elements_with_units(state):
+    """A problem with a force in units of astropy: the same orbit as in numbers."""
+    u = pytest.importorskip("astropy.units")
+    from dvi_jax import interop
+
+    nb = systems.n_body(MASSES, *state, G=ARGS["G"])
+    problem = forces.Relativity(lambda args: args["c"]).add_to(nb, args={"c": LIGHT})
+    speed = u.au / u.day
+    units = interop.UnitSystem(u.au, u.day, u.Msun, args={
+        "masses": u.Msun, "G": u.au**3 / u.day**2 / u.Msun, "c": speed})  # fmt: skip
+    args = {"masses": MASSES * u.Msun, "G": ARGS["G"] * units.args["G"]}
+    args["c"] = (LIGHT * speed).to(u.km / u.s)
+    observe = {"orbits": elements.Elements(frame="jacobi")}
+    run = {"num_steps": 3, "method": dvi.GaussLegendre(2), "observe": observe}
+    sol = interop.integrate(
+        problem, nb.q0 * u.au, nb.p0 * u.Msun * speed, h=0.24 * u.h, args=args, units=units, **run
+    )
+    wanted = dvi.integrate(problem, h=0.01, **run)
+    np.testing.assert_allclose(sol.observed["orbits"], wanted.observed["orbits"], rtol=1e-12)
+    with pytest.raises(ValueError, match="args c is in"):
+        interop.integrate(
+            problem, nb.q0 * u.au, nb.p0 * u.Msun * speed, h=0.24 * u.h,
+            args=args | {"c": 1.0 * u.km}, units=units, **run,
+        )  # fmt: skip
+    with pytest.raises(TypeError, match="q"):
+        elements.Keplerian.from_state(state[0] * u.au, state[1] * speed, 1.0)
+
+
+@pytest.mark.slow
+def test_forces_in_other_questions():
+    """Sweeps, batches, second derivatives, stops and the order of a drift, as single runs say."""
+    q, v = elements.Keplerian(1.0, 0.2, 0.3, 0.4, 0.5, 0.6).state(1.0)
+
+    def kepler(t0, t1, q0, p1, args):
+        return p1 @ p1 / 2 - args["mu"] / jnp.sqrt(q0 @ q0)
+
+    system = dvi.System(kepler, force=forces.Radiation(lambda args: args["beta"], LIGHT))
+    run = {"epsilon": 1.0, "h": 0.05, "num_steps": 40}
+    observe = elements.Elements()
+
+    @jax.jit
+    def end(beta):
+        args = {"mu": 1.0, "beta": beta}
+        sol = dvi.integrate(system, q, v, args=args, observe=observe, adjoint=dvi.Direct(), **run)
+        return sol.observed[-1]
+
+    betas = np.array([0.0, 0.1, 0.2])
+    singles = np.array([end(beta) for beta in betas])
+    np.testing.assert_allclose(jax.vmap(end)(jnp.asarray(betas)), singles, rtol=1e-12)
+    axis = dvi.Axis("beta", betas)
+    swept = dvi.sweep(system, q, v, args={"mu": 1.0, "beta": axis}, observe={"e": observe}, **run)
+    np.testing.assert_allclose(np.asarray(swept["e"])[:, -1], singles, rtol=1e-12)
+    second = jax.jacfwd(jax.jacfwd(end))(0.1)
+    step = 1e-3
+    differences = (end(0.1 + step) - 2 * end(0.1) + end(0.1 - step)) / step**2
+    np.testing.assert_allclose(second, differences, rtol=1e-4, atol=1e-6)
+    stop = dvi.Stop(lambda t, q, p, args: elements.Keplerian.from_state(q, p, args["mu"]).M - 1.0)
+    stopped = dvi.integrate(system, q, v, args={"mu": 1.0, "beta": 0.0}, stop=stop, **run)
+    assert stopped.status == "stopped"
+    assert float(np.nanmax(np.where(np.isfinite(stopped.qs[:, 0]), stopped.ts, np.nan))) < 0.5
+
+    def energy(t, q, p, args):
+        return p @ p / 2 - args["mu"] / jnp.sqrt(q @ q)
+
+    order = dvi.drift_order(
+        system, energy, q, v, args={"mu": 1.0, "beta": 0.5}, h=0.02, num_steps=200,
+        epsilons=[1e-3, 3e-3, 1e-2, 3e-2], method=dvi.KahanLi(8),
+    )  # fmt: skip
+    assert order.slope == pytest.approx(1, abs=0.05)

@@ -12,6 +12,7 @@ Every function returns the `Axes` it drew on, one or an array of them; `save` wr
 
 from matplotlib import pyplot as plt  # noqa: F401 (plot.plt.close closes a figure)
 
+from .elements import elements as elements
 from .films import animate as animate
 from .fits import (
     fit_against_data as fit_against_data,

@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -127,10 +127,11 @@ class Force(eqx.Module):
 
     __rmul__ = __mul__
 
-    def add_to(self, problem: Problem, epsilon: float = 1.0) -> Problem:
+    def add_to(self, problem: Problem, epsilon: float = 1.0, args: Any = None) -> Problem:
         """The problem with this force, next to the forces that it has; ε of its runs is `epsilon`.
 
-        Its known invariants and symmetries are those without this force.
+        `args`: dict of parameters of the force, stored next to those of the problem. Its known
+        invariants and symmetries are those without this force.
 
         **Raises** `TypeError` for another object than a problem.
         """
@@ -139,7 +140,10 @@ class Force(eqx.Module):
         force = self if system.force is None else _Pair(system.force, system.epsilon, self)
         fields = {"perturbation": system.perturbation, "slow_time": system.slow_time}
         new_system = System(system.H_D, force=force, epsilon=epsilon, **fields)
-        return dataclasses.replace(problem, system=new_system)
+        if args is not None:
+            own = {} if problem.args is None else problem.args
+            args = {**own, **instance("args", args, Mapping, "a dict of parameters")}
+        return dataclasses.replace(problem, system=new_system, args=args or problem.args)
 
 
 class Sum(Force):
