@@ -32,11 +32,12 @@ _MOST = 10_000
 """Substeps in one motion of the part A, after which the status is `not_converged`."""
 
 
-def _extrapolation(n: np.ndarray) -> np.ndarray:
+def _extrapolation(counts: np.ndarray) -> np.ndarray:
     """The weights of results with n steps, whose errors are series in 1/n²."""
-    s = n * n
-    others = ~np.eye(len(n), dtype=bool)
-    return np.where(others, s[:, None] / np.where(others, s[:, None] - s, 1), 1).prod(axis=1)
+    squares = counts * counts
+    others = ~np.eye(len(counts), dtype=bool)
+    differences = np.where(others, squares[:, None] - squares, 1)
+    return np.where(others, squares[:, None] / differences, 1).prod(axis=1)
 
 
 _WEIGHTS = _extrapolation(_SUBSTEPS)
@@ -62,7 +63,7 @@ class Encounters(NamedTuple):
 
     def without_pull(self, x: Array, acceleration: Array) -> Array:
         """The accelerations of all bodies at the positions x, less those by close pairs."""
-        return self._if_any(lambda a: a.at[1:].add(-self.pull(x[1:])), acceleration)
+        return self._if_any(lambda rates: rates.at[1:].add(-self.pull(x[1:])), acceleration)
 
     def motion(self, h: Scalar, X: Array, V: Array, kepler: tuple) -> tuple[Array, Array, Array]:
         """(dX, dV, whether they are accurate) of the part A over the time h; `kepler`: those of the
@@ -104,12 +105,12 @@ def _motion(*operands: Array) -> list[Array]:
     tolerance = _TOLERANCE * float(jnp.finfo(X.dtype).eps)
 
     def acceleration(X):
-        r = jnp.sqrt(jnp.sum(X * X, axis=-1, keepdims=True))
-        a = pairs.pull(X) - pairs.mu[:, None] / (r * r * r) * X
-        return jnp.where(is_member, a, 0)
+        radius = jnp.sqrt(jnp.sum(X * X, axis=-1, keepdims=True))
+        rate = pairs.pull(X) - pairs.mu[:, None] / (radius * radius * radius) * X
+        return jnp.where(is_member, rate, 0)
 
-    def leapfrog(n, step, x, v, a0):
-        """The changes after n steps; the velocity is half a step ahead in between."""
+    def leapfrog(number, step, x, v, rate):
+        """The changes after a number of steps; the velocity is half a step ahead in between."""
 
         def advance(state):
             i, dx, dv, _ = state
@@ -117,24 +118,24 @@ def _motion(*operands: Array) -> list[Array]:
             kick = step * acceleration(x + dx)
             return i + 1, dx, dv + kick, kick
 
-        start = jnp.zeros_like(n), jnp.zeros_like(x), step / 2 * a0, jnp.zeros_like(x)
-        _, dx, dv, kick = lax.while_loop(lambda state: state[0] < n, advance, start)
+        start = jnp.zeros_like(number), jnp.zeros_like(x), step / 2 * rate, jnp.zeros_like(x)
+        _, dx, dv, kick = lax.while_loop(lambda state: state[0] < number, advance, start)
         return jnp.stack([dx, dv - kick / 2])
 
     def attempt(state):
         t, step, dX, dV, _, count = state
         step = jnp.where(jnp.abs(step) < jnp.abs(h - t), step, h - t)
         x, v = X + dX, V + dV
-        a = acceleration(x)
+        rate = acceleration(x)
 
         def add(sums, row):
-            n, weight, of_error = row
-            change = leapfrog(n, step / n, x, v, a)
+            number, weight, of_error = row
+            change = leapfrog(number, step / number, x, v, rate)
             return (sums[0] + weight * change, sums[1] + of_error * change), None
 
         zero = jnp.zeros((2, *x.shape), x.dtype)
         (change, error), _ = lax.scan(add, (zero, zero), rows)
-        scale = _size(jnp.stack([v, a])) * jnp.abs(step) + _size(change)
+        scale = _size(jnp.stack([v, rate])) * jnp.abs(step) + _size(change)
         error = jnp.max(_size(error) / jnp.where(scale > 0, scale, 1))
         is_finite = jnp.all(jnp.isfinite(change))
         is_good = is_finite & (error <= tolerance)
@@ -145,7 +146,7 @@ def _motion(*operands: Array) -> list[Array]:
         t = jnp.where(is_good, jnp.where(step == h - t, h, t + step), t)
         # The flow does not depend on the substeps.
         step = lax.stop_gradient(step * factor)
-        return t, step, dX + take[0], dV + take[1], jnp.all(jnp.isfinite(a)), count + 1
+        return t, step, dX + take[0], dV + take[1], jnp.all(jnp.isfinite(rate)), count + 1
 
     def proceed(state):
         t, _, _, _, has_start, count = state

@@ -274,11 +274,11 @@ class WisdomHolman(SplittingMethod):
 
     def _check_attraction(self, equations, interval, q, p, scale):
         """**Raises** `ValueError` if bodies next to one another do not attract by Newton's law."""
-        n, unit = len(q) - 1, np.linalg.norm(np.asarray(q[1] - q[0]))
+        others, unit = np.arange(len(q) - 1), np.linalg.norm(np.asarray(q[1] - q[0]))
         x = np.array(q)
-        x[1:] = x[1] + 1e-6 * unit * np.arange(n)[:, None]
+        x[1:] = x[1] + 1e-6 * unit * others[:, None]
         x = jnp.asarray(x)
-        pairs = self._pairs(equations, interval, x, ~jnp.eye(n, dtype=bool))
+        pairs = self._pairs(equations, interval, x, ~jnp.eye(len(others), dtype=bool))
         pull = np.asarray(pairs.pull(x[1:]))
         rest = np.asarray(equations.momentum_rate(interval, x, p) / scale)[1:] - pull
         size, of_first = np.abs(pull).max(), float(pairs.mu[0]) / unit**2
