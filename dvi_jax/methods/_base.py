@@ -81,8 +81,10 @@ class Method(eqx.Module):
         """The same for steps of one length, without what two neighbours undo."""
         return self.in_coordinates(equations, interval, q)
 
-    def count(self, equations: Equations, interval: Interval, *states: State) -> dict[str, Array]:
-        """Integers for a step (q0, p0, q1, p1), whose sums are in ``solution.stats``."""
+    def count(
+        self, equations: Equations, interval: Interval, q0: State, p0: State, q1: State, p1: State
+    ) -> dict[str, Array]:
+        """Integers for a step, whose sums over the run are in ``solution.stats``."""
         return {}
 
     def check(

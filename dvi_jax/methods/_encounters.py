@@ -7,6 +7,7 @@ In democratic coordinates the pair (i, j) is moved from the part B to the part A
 The pairs are chosen once for a step, so that it is one of a symmetric splitting.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -31,11 +32,12 @@ _MOST = 10_000
 """Substeps in one motion of the part A, after which the status is `not_converged`."""
 
 
-def _extrapolation(n: np.ndarray) -> np.ndarray:
+def _extrapolation(counts: np.ndarray) -> np.ndarray:
     """The weights of results with n steps, whose errors are series in 1/n²."""
-    s = n * n
-    others = ~np.eye(len(n), dtype=bool)
-    return np.where(others, s[:, None] / np.where(others, s[:, None] - s, 1), 1).prod(axis=1)
+    squares = counts * counts
+    others = ~np.eye(len(counts), dtype=bool)
+    differences = np.where(others, squares[:, None] - squares, 1)
+    return np.where(others, squares[:, None] / differences, 1).prod(axis=1)
 
 
 _WEIGHTS = _extrapolation(_SUBSTEPS)
@@ -43,58 +45,72 @@ _OF_ERROR = _WEIGHTS - np.append(0.0, _extrapolation(_SUBSTEPS[1:]))
 
 
 class Encounters(NamedTuple):
-    """The bodies around the first one: their `masses` times G, μ of their Kepler orbits, the
-    distances below which a pair is close, in units of the distance to the first body, and the
-    square of the softening."""
+    """The close pairs of the bodies around the first one, a matrix `close`, their `masses` times G,
+    μ of their Kepler orbits, and the square of the softening."""
 
     masses: Array
     mu: Array
-    radii: Array
     softening: Scalar
+    close: Bool[Array, "n n"]
 
-    def close(self, h: Scalar, X: Array, V: Array) -> Bool[Array, "n n"]:
-        """The pairs that are close along straight lines during a time h before and after."""
-        radius = self.radii * _length(X)
-        x, v = _pairs(X), _pairs(V)
-        v2 = jnp.sum(v * v, axis=-1)
-        # The same for (h, V) and (−h, −V): judged at both ends, a step back has the same pairs.
-        time = jnp.minimum(jnp.abs(jnp.sum(x * v, axis=-1)) / jnp.where(v2 > 0, v2, 1), jnp.abs(h))
-        sign = jnp.where(jnp.sum(x * v, axis=-1) > 0, -1.0, 1.0).astype(time.dtype)
-        nearest = x + (sign * time)[..., None] * v
-        near = _length(nearest) < jnp.maximum(radius[:, None], radius[None])
-        return near & ~jnp.eye(len(X), dtype=bool)
-
-    def pull(self, x: Array, close: Array) -> Array:
+    def pull(self, x: Array) -> Array:
         """The accelerations by the attraction of close pairs."""
-        difference = _pairs(x)
+        difference = x[:, None] - x[None]
         square = jnp.sum(difference * difference, axis=-1) + self.softening
-        square = jnp.where(close, square, 1)
-        weight = jnp.where(close, -self.masses[None] / (square * jnp.sqrt(square)), 0)
+        square = jnp.where(self.close, square, 1)
+        weight = jnp.where(self.close, -self.masses[None] / (square * jnp.sqrt(square)), 0)
         return jnp.sum(weight[..., None] * difference, axis=1)
 
-    def motion(self, h: Scalar, X: Array, V: Array, close: Array) -> tuple[Array, Array, Array]:
-        """The changes of X and V of the bodies in close pairs, in the part A over the time h, and
-        whether they were found; 0 for other bodies."""
-        dX, dV, left = _differentiable(_motion, [*self, h, X, V, close])
-        return dX, dV, left == 0
+    def without_pull(self, x: Array, acceleration: Array) -> Array:
+        """The accelerations of all bodies at the positions x, less those by close pairs."""
+        return self._if_any(lambda rates: rates.at[1:].add(-self.pull(x[1:])), acceleration)
+
+    def motion(self, h: Scalar, X: Array, V: Array, kepler: tuple) -> tuple[Array, Array, Array]:
+        """(dX, dV, whether they are accurate) of the part A over the time h; `kepler`: those of the
+        Kepler orbits, which other bodies move on."""
+
+        def with_pairs(kepler):
+            dX, dV, left = _differentiable(_motion, [*self, h, X, V])
+            is_member = jnp.any(self.close, axis=1)[:, None]
+            moved = (jnp.where(is_member, *pair) for pair in zip((dX, dV), kepler, strict=False))
+            return *moved, kepler[2] & (left == 0)
+
+        return self._if_any(with_pairs, kepler)
+
+    def _if_any(self, function: Callable, values: Any) -> Any:
+        return lax.cond(lanewise.on_any(jnp.any(self.close)), function, lambda x: x, values)
+
+
+def close_pairs(h: Scalar, X: Array, V: Array, radii: Array) -> Bool[Array, "n n"]:
+    """The pairs that are close on straight lines during h/2 before and after: nearer than the
+    larger of their `radii`, in units of the distance to the first body."""
+    x, v = X[:, None] - X[None], V[:, None] - V[None]
+    radius = radii * jnp.sqrt(jnp.sum(X * X, axis=-1))
+    v2, xv = jnp.sum(v * v, axis=-1), jnp.sum(x * v, axis=-1)
+    # The same for (h, V) and (−h, −V): judged at both ends, a step back has the same pairs.
+    limit = jnp.abs(h) / 2
+    time = jnp.clip(-xv / jnp.where(v2 > 0, v2, 1), -limit, limit)[..., None]
+    nearest = jnp.sum((x + time * v) ** 2, axis=-1)
+    near = nearest < jnp.maximum(radius[:, None], radius[None]) ** 2
+    return near & ~jnp.eye(len(X), dtype=bool)
 
 
 def _motion(*operands: Array) -> list[Array]:
-    """The changes, and the time that is left, by Gragg, Bulirsch and Stoer's extrapolation of the leapfrog."""
-    *constants, h, X, V, close = operands
-    bodies = Encounters(*constants)
-    is_member = jnp.any(close, axis=1)[:, None]
+    """The changes, and the time that is left, by Gragg's extrapolation of the leapfrog."""
+    *constants, h, X, V = operands
+    pairs = Encounters(*constants)
+    is_member = jnp.any(pairs.close, axis=1)[:, None]
     V = jnp.where(is_member, V, 0)
     rows = tuple(jnp.asarray(x, X.dtype) for x in (_SUBSTEPS, _WEIGHTS, _OF_ERROR))
     tolerance = _TOLERANCE * float(jnp.finfo(X.dtype).eps)
 
     def acceleration(X):
-        r = _length(X)[:, None]
-        a = bodies.pull(X, close) - bodies.mu[:, None] / (r * r * r) * X
-        return jnp.where(is_member, a, 0)
+        radius = jnp.sqrt(jnp.sum(X * X, axis=-1, keepdims=True))
+        rate = pairs.pull(X) - pairs.mu[:, None] / (radius * radius * radius) * X
+        return jnp.where(is_member, rate, 0)
 
-    def leapfrog(n, step, x, v, a0):
-        """The changes after n steps; the velocity is half a step ahead in between."""
+    def leapfrog(number, step, x, v, rate):
+        """The changes after a number of steps; the velocity is half a step ahead in between."""
 
         def advance(state):
             i, dx, dv, _ = state
@@ -102,54 +118,44 @@ def _motion(*operands: Array) -> list[Array]:
             kick = step * acceleration(x + dx)
             return i + 1, dx, dv + kick, kick
 
-        start = jnp.zeros_like(n), jnp.zeros_like(x), step / 2 * a0, jnp.zeros_like(x)
-        _, dx, dv, kick = lax.while_loop(lambda state: state[0] < n, advance, start)
+        start = jnp.zeros_like(number), jnp.zeros_like(x), step / 2 * rate, jnp.zeros_like(x)
+        _, dx, dv, kick = lax.while_loop(lambda state: state[0] < number, advance, start)
         return jnp.stack([dx, dv - kick / 2])
 
     def attempt(state):
         t, step, dX, dV, _, count = state
         step = jnp.where(jnp.abs(step) < jnp.abs(h - t), step, h - t)
         x, v = X + dX, V + dV
-        a = acceleration(x)
+        rate = acceleration(x)
 
         def add(sums, row):
-            n, weight, of_error = row
-            change = leapfrog(n, step / n, x, v, a)
+            number, weight, of_error = row
+            change = leapfrog(number, step / number, x, v, rate)
             return (sums[0] + weight * change, sums[1] + of_error * change), None
 
         zero = jnp.zeros((2, *x.shape), x.dtype)
         (change, error), _ = lax.scan(add, (zero, zero), rows)
-        scale = _size(jnp.stack([v, a])) * jnp.abs(step) + _size(change)
+        scale = _size(jnp.stack([v, rate])) * jnp.abs(step) + _size(change)
         error = jnp.max(_size(error) / jnp.where(scale > 0, scale, 1))
-        is_good = error <= tolerance
+        is_finite = jnp.all(jnp.isfinite(change))
+        is_good = is_finite & (error <= tolerance)
         ratio = tolerance / jnp.maximum(error, tolerance / 4.0**11)
-        factor = jnp.clip(0.9 * ratio ** (1 / 11), 0.1, 4.0)
+        factor = jnp.where(is_finite, jnp.clip(0.9 * ratio ** (1 / 11), 0.1, 4.0), 0.1)
         take = jnp.where(is_good, change, 0)
         # The last substep ends at h, also where the sum of the substeps is not h.
         t = jnp.where(is_good, jnp.where(step == h - t, h, t + step), t)
-        # The substeps are no functions of the state for derivatives: those of the flow do not
-        # depend on them.
+        # The flow does not depend on the substeps.
         step = lax.stop_gradient(step * factor)
-        return t, step, dX + take[0], dV + take[1], jnp.isfinite(error), count + 1
+        return t, step, dX + take[0], dV + take[1], jnp.all(jnp.isfinite(rate)), count + 1
 
     def proceed(state):
-        t, _, _, _, is_finite, count = state
-        return (t != h) & is_finite & (count < _MOST)
+        t, _, _, _, has_start, count = state
+        return (t != h) & has_start & (count < _MOST)
 
     zero, count = jnp.zeros_like(X), jnp.asarray(0, jnp.int32)
     start = jnp.zeros_like(h), h, zero, zero, jnp.asarray(True), count
     t, _, dX, dV, _, _ = lax.while_loop(proceed, attempt, start)
     return [dX, dV, lax.stop_gradient(h - t)]
-
-
-def _pairs(x: Array) -> Array:
-    return x[:, None] - x[None]
-
-
-def _length(x: Array) -> Array:
-    """|x| along the last axis, where it is 0 with the derivative 0."""
-    square = jnp.sum(x * x, axis=-1)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def _size(x: Array) -> Array:
@@ -160,7 +166,7 @@ def _differentiable(function: Callable, operands: Sequence[Any]) -> list[Array]:
     """The list of arrays ``function(*operands)`` with the derivatives of its forward mode, of every
     order, also in reverse mode, which a loop of unknown length does not have."""
 
-    def rule(operands, changes):
+    def rule(operands, changes) -> list[Array | None]:
         places = tuple(i for i in changes if jnp.issubdtype(operands[i].dtype, jnp.inexact))
 
         def jacobians(*operands):
@@ -169,9 +175,10 @@ def _differentiable(function: Callable, operands: Sequence[Any]) -> list[Array]:
         # In the order of the results, and for each in that of the places.
         matrices = iter(_differentiable(jacobians, operands))
         count = len(jax.eval_shape(function, *operands))
-        return [
-            sum(jnp.tensordot(next(matrices), changes[i], changes[i].ndim) for i in places)
+        products = [
+            [jnp.tensordot(next(matrices), changes[i], changes[i].ndim) for i in places]
             for _ in range(count)
         ]
+        return [functools.reduce(jnp.add, terms) for terms in products]
 
     return lanewise.with_derivative(function, rule, operands)

@@ -1,5 +1,6 @@
 """Splittings of N bodies around Kepler orbits: the method of Wisdom and Holman."""
 
+import functools
 import warnings
 from typing import Any, ClassVar, Literal, get_args
 
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 import lanewise
 from lanewise.jaxprs.dependence import depends_on
@@ -20,7 +21,7 @@ from ..engine.newton import find_root
 from ..problem import kepler as _kepler
 from ..problem.flows import value_of
 from ..problem.frames import Democratic, Jacobi
-from ._encounters import Encounters
+from ._encounters import Encounters, close_pairs
 from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, join_neighbours
 from ._splitting import PartFlow, SplittingMethod, Stage
 from ._strang import Strang
@@ -59,14 +60,28 @@ class WisdomHolman(SplittingMethod):
       saved states. It is applied at save points and where states are observed, so save rarely: one
       output takes the time of 8 (order 3) to 64 (order 17) further steps.
     - `scheme`: as for `Splitting`, for example (10, 6, 4) for long steps at high accuracy.
+    - `encounters`: pairs of bodies that come closer than this number of Hill radii, for example
+      3.0, are integrated apart, in democratic coordinates; see below. None: no pair is.
     - `G`: the gravitational constant in the Kepler part, a number or a function of args; None:
       ``args["G"]`` if there is one, else 1. Another value changes the accuracy, not the limit.
 
     A run stays in these coordinates, also where states are observed: those that are saved or
     observed are converted copies. Between save points, where nothing is observed, the two half
-    flows at the ends of neighbouring steps are one. An orbit may have any eccentricity. Bodies
-    close to another body than the first are not resolved: use `KahanLi` or `AdaptiveReversible` for
-    close encounters.
+    flows at the ends of neighbouring steps are one. An orbit may have any eccentricity.
+
+    **Close encounters** of other bodies than the first are resolved with `encounters` only. A pair
+    (i, j) is close if its distance, along straight lines during h/2 before and after, is less
+    than `encounters` times the larger of r_i (m_i/3m_0)^{1/3}. In a step with close pairs
+
+        H_A′ = H_A − Σ_close G m_i m_j/|q_i − q_j|,    H_B′ = H_B + Σ_close G m_i m_j/|q_i − q_j|,
+
+    and the bodies in them are moved by H_A′ to round-off, by an extrapolation method of order 12.
+    Pairs that are close at the end of a step and not at its start are added, and the step is
+    repeated: a run with −h has the same pairs and returns to round-off. (Not where the steps with
+    and without a pair differ in whether it is close at the end; then by the error of one step.)
+    ``stats["encounter_steps"]`` counts the steps with close pairs. Derivatives are those for the
+    given pairs. Many revolutions of a pair in one step fail with the status `not_converged`.
+    Recoil of the first body from a massive one near its pericentre is not resolved.
 
     A run whose h and initial state are known **warns** if the interaction is evaluated less than
     ten times in the shortest period, or in a circle with the angular velocity of a pericentre: such
@@ -78,7 +93,8 @@ class WisdomHolman(SplittingMethod):
     **Source** Wisdom & Holman 1991, *Astron. J.* 102, 1528; Duncan, Levison & Lee 1998, *Astron.
     J.* 116, 2067 (democratic); Wisdom, Holman & Touma 1996, *Fields Inst. Commun.* 10, 217 and
     Wisdom 2006, *Astron. J.* 131, 2294 (correctors; their coefficients follow here from the linear
-    conditions); Rein & Tamayo 2015, *MNRAS* 452, 376.
+    conditions); Rein & Tamayo 2015, *MNRAS* 452, 376; Lu, Hernandez & Rein 2024, *MNRAS* 533, 3708
+    (encounters).
     """
 
     coordinates: Coordinates = eqx.field(static=True, default="jacobi")
@@ -102,7 +118,7 @@ class WisdomHolman(SplittingMethod):
 
         if self.encounters is not None:
             positive("encounters", self.encounters)
-            one_of('coordinates of a method with encounters', self.coordinates, ("democratic",))
+            one_of("coordinates of a method with encounters", self.coordinates, ("democratic",))
 
     def is_double_only(self, equations) -> bool:
         return True
@@ -131,6 +147,8 @@ class WisdomHolman(SplittingMethod):
                 f"has the mass {masses.max():g} and body 0 only {masses[0]:g}."
             )
         self._check_steps(equations, interval, q, p)
+        if self.encounters is not None and len(q) > 2:
+            self._check_attraction(equations, interval, *equations.absolute(q, p), scale)
 
     def _check_steps(self, equations, interval, q, p):
         """Warn of too few evaluations of the interaction in a revolution, or at a pericentre."""
@@ -187,7 +205,7 @@ class WisdomHolman(SplittingMethod):
         return value_of(_gravity if self.G is None else self.G, equations.args, q)
 
     def parts(self, equations, interval, q, close=None):
-        """The parts; with `close`, pairs of bodies, their attraction is in the first one."""
+        """The parts. The attraction of `close` pairs of bodies is in the first one."""
         frame, scale = self._frame(equations, interval, q)
         mu = self._strength(equations, q) * frame.central_mass()
         # With an origin states are relative to it, in these coordinates too: they are linear.
@@ -195,7 +213,7 @@ class WisdomHolman(SplittingMethod):
         position, momentum = equations.absolute(zero, zero)
         base = frame.from_bodies(position), frame.velocities_of(momentum / scale)
         implicit = not equations.step_is_explicit(interval, q)
-        bodies = self._bodies(equations, interval, q) if close is not None else None
+        pairs = None if close is None else self._pairs(equations, interval, q, close)
 
         def attraction(X):
             """The accelerations of the Kepler part."""
@@ -207,17 +225,10 @@ class WisdomHolman(SplittingMethod):
         def kepler(interval, X, V):
             h = interval.h
             full_X, full_V = base[0] + X, base[1] + V
-            dX, dV, is_root = _kepler.change(h, full_X[1:], full_V[1:], mu)
-            if close is not None:
-
-                def meet():
-                    *motion, is_found = bodies.motion(h, full_X[1:], full_V[1:], close)
-                    is_member = jnp.any(close, axis=1)[:, None]
-                    new = (jnp.where(is_member, *pair) for pair in zip(motion, (dX, dV)))
-                    return *new, is_root & is_found
-
-                is_any = lanewise.on_any(jnp.any(close))
-                dX, dV, is_root = lax.cond(is_any, meet, lambda: (dX, dV, is_root))
+            motion = _kepler.change(h, full_X[1:], full_V[1:], mu)
+            if pairs is not None:
+                motion = pairs.motion(h, full_X[1:], full_V[1:], motion)
+            dX, dV, is_root = motion
             X1 = X + jnp.concatenate([h * full_V[:1], dX])
             V1 = V + jnp.concatenate([jnp.zeros_like(V[:1]), dV])
             return X1, V1, judge(no_solve(X)._replace(converged=is_root), X1, V1)
@@ -228,13 +239,8 @@ class WisdomHolman(SplittingMethod):
             def rate(V):
                 p = scale * frame.velocities_back(V)
                 acceleration = equations.momentum_rate(interval, x, p) / scale
-                if close is not None:
-                    full_x = (position + x)[1:]
-                    is_any = lanewise.on_any(jnp.any(close))
-                    pull = lax.cond(
-                        is_any, lambda: bodies.pull(full_x, close), lambda: jnp.zeros_like(full_x)
-                    )
-                    acceleration = acceleration.at[1:].add(-pull)
+                if pairs is not None:
+                    acceleration = pairs.without_pull(position + x, acceleration)
                 return frame.velocities_of(acceleration) - attraction(base[0] + X)
 
             if not implicit:
@@ -256,36 +262,52 @@ class WisdomHolman(SplittingMethod):
 
         return [PartFlow(kepler, True), PartFlow(interaction, not implicit)]
 
-    def _bodies(self, equations: Equations, interval: Interval, q: State) -> Encounters:
+    def _pairs(
+        self, equations: Equations, interval: Interval, q: State, close: Array
+    ) -> Encounters:
         frame, _ = self._frame(equations, interval, q)
         mu = self._strength(equations, q) * frame.central_mass()
-        m = frame.masses[1:] / frame.masses[0]
-        # Radii decide only. At the mass 0 they have no derivative.
-        radii = self.encounters * jnp.cbrt(lax.stop_gradient(m) / 3)
-        softening = equations.args.get("softening", 0.0) if isinstance(equations.args, dict) else 0
-        return Encounters(m * mu, mu, radii, jnp.asarray(softening, q.dtype) ** 2)
+        args = equations.args if isinstance(equations.args, dict) else {}
+        softening = jnp.asarray(args.get("softening", 0), q.dtype)
+        masses = frame.masses[1:] / frame.masses[0] * mu
+        return Encounters(masses, mu, softening * softening, close)
 
-    def _close(self, equations: Equations, interval: Interval, q: State, p: State) -> Bool[Array, "n n"]:
+    def _check_attraction(self, equations, interval, q, p, scale):
+        """**Raises** `ValueError` if bodies next to one another do not attract by Newton's law."""
+        others, unit = np.arange(len(q) - 1), np.linalg.norm(np.asarray(q[1] - q[0]))
+        x = np.array(q)
+        x[1:] = x[1] + 1e-6 * unit * others[:, None]
+        x = jnp.asarray(x)
+        pairs = self._pairs(equations, interval, x, ~jnp.eye(len(others), dtype=bool))
+        pull = np.asarray(pairs.pull(x[1:]))
+        rest = np.asarray(equations.momentum_rate(interval, x, p) / scale)[1:] - pull
+        size, of_first = np.abs(pull).max(), float(pairs.mu[0]) / unit**2
+        # Where the attraction is so small that the first body hides it, it is not compared.
+        if size > 100 * of_first and np.abs(rest).max() > 0.1 * size:
+            raise ValueError(
+                "encounters of dvi.WisdomHolman requires bodies that attract one another by "
+                "Newton's law with the masses and G of the Kepler orbits, but they do not."
+            )
+
+    def _close(self, equations: Equations, interval: Interval, q: State, p: State) -> Array:
         """The pairs of bodies that are close at a state in these coordinates."""
+        assert self.encounters is not None
         frame, scale = self._frame(equations, interval, q)
-        zero = jnp.zeros_like(q)
-        position, momentum = equations.absolute(zero, zero)
+        position, momentum = equations.absolute(jnp.zeros_like(q), jnp.zeros_like(q))
         X, V = q + frame.from_bodies(position), p + frame.velocities_of(momentum / scale)
-        bodies = self._bodies(equations, interval, q)
-        return lax.stop_gradient(bodies).close(interval.h, *lax.stop_gradient((X[1:], V[1:])))
+        radii = self.encounters * jnp.cbrt(frame.masses[1:] / (3 * frame.masses[0]))
+        return close_pairs(interval.h, X[1:], V[1:], radii)
 
     def compose(self, equations, interval, q, p, stages, parts=None):
+        compose = functools.partial(super().compose, equations, interval, q, p, stages)
         if self.encounters is None:
-            return super().compose(equations, interval, q, p, stages, parts)
+            return compose(parts)
 
         def attempt(state):
             close, *_ = state
-            parts = self.parts(equations, interval, q, close)
-            q1, p1, info = super(WisdomHolman, self).compose(
-                equations, interval, q, p, stages, parts
-            )
-            new = close | self._close(equations, interval, q1, p1)
-            return new, jnp.all(new == close), q1, p1, info
+            q1, p1, info = compose(self.parts(equations, interval, q, close))
+            both = close | self._close(equations, interval, q1, p1)
+            return both, jnp.all(both == close), q1, p1, info
 
         def repeat(state, _):
             is_final = state[1]
@@ -295,20 +317,19 @@ class WisdomHolman(SplittingMethod):
 
             return lax.cond(lanewise.on_any(~is_final, rare=False), again, lambda: state), None
 
-        # Pairs are judged at both ends. A pair that is close at the end only is one of the step,
-        # which is repeated from its start.
+        # Pairs are judged at both ends: with one that is close at the end only, the step is
+        # repeated from its start.
         close = self._close(equations, interval, q, p)
         start = close, jnp.asarray(False), q, p, no_step_yet(q)
-        (_, is_final, q, p, info), _ = lax.scan(repeat, start, None, _ATTEMPTS)
+        (_, _, q, p, info), _ = lax.scan(repeat, start, None, _ATTEMPTS)
         return q, p, info
 
-    def count(self, equations, interval, *states):
+    def count(self, equations, interval, q0, p0, q1, p1):
         if self.encounters is None:
             return {}
-        q0, p0, q1, p1 = states
         ends = (self.enter(equations, interval, *state)[:2] for state in ((q0, p0), (q1, p1)))
-        is_close = [jnp.any(self._close(equations, interval, *state)) for state in ends]
-        return {"encounter_steps": (is_close[0] | is_close[1]).astype(jnp.int32)}
+        close = jnp.stack([self._close(equations, interval, *state) for state in ends])
+        return {"encounter_steps": jnp.any(close).astype(jnp.int32)}
 
     def in_loop(self, equations, interval, q):
         is_fixed = self._is_fixed(equations, interval, q) and self.encounters is None

@@ -96,7 +96,7 @@ class Solution(eqx.Module):
     - `jumps`: of a run with `jump`: a `Jumps`; else None.
     - `stats`: `num_steps`; `newton_iterations` (total); `max_residual` (largest last correction of
       a solve relative to its scale); `failed_step` (number of the failing step from 0, or −1) and
-      `failed_residual` (its last correction, likewise, or 0).
+      `failed_residual` (its last correction, likewise, or 0); others of the grid and the method.
 
     Under `vmap` the first axis of every field is the batch.
     """

@@ -1,0 +1,216 @@
+"""Close encounters in `WisdomHolman`: reversible switching, energy, order, batches, derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import central_difference
+
+import dvi_jax as dvi
+from dvi_jax import elements, forces, systems
+from dvi_jax.methods import _encounters, _wisdom_holman
+
+MASSES = np.array([1.0, 1e-3, 1e-3])
+Q0 = np.array([[-0.0016, 0.0003, 0.0], [0.2176, -0.8012, -0.0028], [1.3448, 0.4861, 0.0091]])
+V0 = np.array([[-0.0007, -0.0012, 0.0], [1.0603, 0.4562, -0.0042], [-0.406, 0.732, 0.0041]])
+TWO = systems.n_body(MASSES, Q0, MASSES[:, None] * V0, h=0.1)
+"""Two planets that meet after five time units, at a hundredth of their distances."""
+
+METHOD = dvi.WisdomHolman("democratic", encounters=3.0)
+ENERGY = TWO.observables["energy"]
+END = dvi.Save(final=True)
+
+
+def shifted(shift):
+    return jnp.asarray(Q0).at[2, 0].add(shift)
+
+
+def round_trip(method, shift):
+    """The difference from the start after 60 steps and as many back, and the steps with a pair."""
+    run = {"num_steps": 60, "method": method, "save": END}
+
+    def there_and_back(shift):
+        out = dvi.integrate(TWO, q0=shifted(shift), h=0.1, **run)
+        back = dvi.integrate(TWO, q0=out.q_final, p0=out.p_final, h=-0.1, **run)
+        counts = [sol.stats["encounter_steps"] for sol in (out, back)]
+        return jnp.abs(back.q_final - shifted(shift)).max(), jnp.stack(counts)
+
+    return jax.jit(jax.vmap(there_and_back))(shift)
+
+
+def test_a_run_back_returns_to_the_start_through_an_encounter(monkeypatch):
+    shifts = np.linspace(0, 4e-3, 200)
+    defect, counts = round_trip(METHOD, shifts)
+    assert defect.max() < 1e-11
+    assert counts.min() > 20
+    # Judged at the start of the step alone, the step back has other pairs.
+    monkeypatch.setattr(_wisdom_holman, "_ATTEMPTS", 1)
+    defect, _ = round_trip(dvi.WisdomHolman("democratic", encounters=3.0 + 1e-12), shifts)
+    assert defect.min() > 1e-6
+
+
+@pytest.mark.slow
+def test_without_an_encounter_the_steps_are_those_of_the_plain_method():
+    """And with one they are not; its energy error is that of the steps before."""
+    energy = {"drift": dvi.MaxDrift(ENERGY)}
+
+    def run(method, num_steps):
+        return dvi.integrate(TWO, num_steps=num_steps, method=method, observe=energy, save=END)
+
+    plain = dvi.WisdomHolman("democratic")
+    before = run(METHOD, 10), run(plain, 10)
+    assert before[0].stats["encounter_steps"] == 0
+    assert "encounter_steps" not in before[1].stats
+    np.testing.assert_array_equal(before[0].q_final, before[1].q_final)
+    np.testing.assert_array_equal(before[0].p_final, before[1].p_final)
+    after = run(METHOD, 60), run(plain, 60)
+    assert after[0].stats["encounter_steps"] > 20
+    assert abs(float(after[0].observed["drift"])) < 3e-9
+    assert abs(float(after[1].observed["drift"])) > 3e-7
+
+
+def test_each_trajectory_of_a_batch_decides_for_itself():
+    shifts = np.array([0.0, 0.3, np.nan, 2e-3])  # the second meets nobody, the third is no state
+
+    def end(shift):
+        sol = dvi.integrate(
+            TWO, q0=shifted(shift), num_steps=60, method=METHOD, save=END, throw=False
+        )
+        return sol.q_final, sol.stats["encounter_steps"], sol.result == dvi.RESULTS.successful
+
+    batch = jax.jit(jax.vmap(end))(shifts)
+    alone = jax.jit(end)
+    for i, shift in enumerate(shifts):
+        for together, single in zip(batch, alone(shift), strict=True):
+            np.testing.assert_array_equal(together[i], single)
+    assert batch[2].tolist() == [True, True, False, True]
+    assert (batch[1] > 0).tolist() == [True, False, False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mass", [0.0, 1e-3])
+def test_the_order_is_kept_with_forces_and_softening(mass):
+    """Against small steps of another method, which resolves the encounter. The second body is a
+    test particle or a planet, and the force depends on velocities."""
+    masses = np.array([1.0, 1e-3, mass])
+    momenta = np.where(masses > 0, masses, 1)[:, None] * V0
+    start = systems.n_body(masses, Q0, momenta, h=0.1, softening=1e-2)
+    problem = forces.Relativity(lambda args: args["c"]).add_to(start)
+
+    def end(steps, method):
+        sol = dvi.integrate(
+            problem, args=start.args | {"c": 30.0}, h=6.0 / steps, num_steps=steps, method=method,
+            save=END,
+        )  # fmt: skip
+        return np.asarray(sol.q_final), sol.stats.get("encounter_steps", 0)
+
+    exact, _ = end(6000, dvi.KahanLi(8))
+    found = [end(steps, METHOD) for steps in (120, 240, 480)]
+    errors = np.array([np.abs(q - exact).max() for q, _ in found])
+    assert min(count for _, count in found) > 10
+    np.testing.assert_allclose(errors[:-1] / errors[1:], 4, atol=0.5)
+
+
+def loss_with(adjoint):
+    def loss(x):
+        """Of a state after the encounter, by the initial state and the masses."""
+        q, masses = x
+        sol = dvi.integrate(
+            TWO, q0=q, p0=masses[:, None] * V0, args={"masses": masses, "G": 1.0}, num_steps=60,
+            method=METHOD, save=END, adjoint=adjoint,
+        )  # fmt: skip
+        return jnp.sum(sol.q_final**2)
+
+    return loss
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", [dvi.Direct(), dvi.Checkpointed(), dvi.Reversible()])
+def test_gradients_are_those_of_the_pairs_taken(adjoint):
+    loss, x = loss_with(adjoint), (jnp.asarray(Q0), jnp.asarray(MASSES))
+    rng = np.random.default_rng(1)
+    direction = tuple(jnp.asarray(rng.normal(size=a.shape)) * a for a in x)
+    gradient = jax.jit(jax.grad(loss))(x)
+    expected = central_difference(jax.jit(loss), x, direction, step=3e-7)
+    ours = sum(jnp.vdot(g, d) for g, d in zip(gradient, direction, strict=True))
+    assert abs(ours / expected - 1) < 1e-6
+    assert abs(expected) > 1
+
+
+def test_a_motion_that_is_not_found_is_a_status(monkeypatch):
+    monkeypatch.setattr(_encounters, "_MOST", 3)
+    method = dvi.WisdomHolman("democratic", encounters=3.1)
+    sol = dvi.integrate(TWO, num_steps=60, method=method, save=END, throw=False)
+    assert sol.status == "not_converged"
+    assert 0 < sol.stats["encounter_steps"] < 39
+    assert np.isnan(sol.q_final).all()
+
+
+def test_what_the_encounters_require_is_named():
+    with pytest.raises(ValueError, match="must be 'democratic', got 'jacobi'"):
+        dvi.WisdomHolman(encounters=3.0)
+    with pytest.raises(ValueError, match="encounters must be"):
+        dvi.WisdomHolman("democratic", encounters=-1.0)
+
+    def free(t0, t1, q0, p1, args):  # planets that do not attract one another
+        inner = q0[1:] - q0[:1]
+        pull = jnp.sum(args["masses"][1:] / jnp.sqrt(jnp.sum(inner**2, axis=1)))
+        return jnp.sum(p1**2 / args["masses"][:, None]) / 2 - pull
+
+    with pytest.raises(ValueError, match="attract one another"):
+        dvi.integrate(
+            dvi.System(free), TWO.q0, TWO.p0, args=TWO.args, h=0.1, num_steps=1, method=METHOD
+        )
+
+
+def heavy_planets():
+    """Jupiter and Saturn with 50 times their masses, which scatter (Duncan, Levison & Lee 1998)."""
+    outer = systems.outer_solar_system()
+    masses, q = np.array(outer.args["masses"])[:3], np.array(outer.q0)[:3]
+    v = np.array(outer.p0)[:3] / masses[:, None]
+    masses[1:] *= 50
+    centre = lambda x: x - masses @ x / masses.sum()  # noqa: E731
+    return masses, centre(q), centre(v), outer.args["G"], 40.0, 40_000
+
+
+def three_jupiters():
+    masses = np.array([1.0, 1e-3, 1e-3, 1e-3])
+    G = systems.outer_solar_system().args["G"]
+    numbers = np.arange(3.0)
+    a, e, inc = np.array([[5.0, 6.7, 9.0], [0.02, 0.05, 0.03], [0.01, 0.02, 0.03]])
+    angles = {"Omega": numbers, "omega": numbers, "M": 2 * numbers}
+    orbits = elements.Keplerian(a, e, inc, **{k: jnp.asarray(x) for k, x in angles.items()})
+    q, p = map(np.array, elements.to_bodies(orbits, masses, G=G))
+    return masses, q, p / masses[:, None], G, 100.0, 100_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("problem", [heavy_planets, three_jupiters])
+def test_energy_errors_are_those_of_trace_and_mercurius(problem):
+    """The trajectories are chaotic and differ; plain steps lose the energy."""
+    rebound = pytest.importorskip("rebound")
+    masses, q, v, G, h, steps = problem()
+
+    def error_of_rebound(integrator):
+        sim = rebound.Simulation()
+        sim.G, sim.integrator, sim.dt = G, integrator, h
+        for m, x, u in zip(masses, q, v, strict=True):
+            names = ("x", "y", "z", "vx", "vy", "vz")
+            sim.add(m=m, **dict(zip(names, (*x, *u), strict=True)))
+        start, errors = sim.energy(), []
+        for k in range(1, steps // 50 + 1):
+            sim.integrate(50 * k * h, exact_finish_time=0)
+            errors.append(abs(sim.energy() / start - 1))
+        return max(errors), np.median(errors)
+
+    start = systems.n_body(masses, q, masses[:, None] * v, h=h, G=G)
+    sol = dvi.integrate(
+        start, num_steps=steps, method=METHOD, save=dvi.Save(every=50), observe={"energy": ENERGY}
+    )
+    energy = np.asarray(sol.observed["energy"])
+    errors = np.abs(energy / energy[0] - 1)
+    theirs = [error_of_rebound(name) for name in ("trace", "mercurius")]
+    assert sol.stats["encounter_steps"] > 30
+    assert errors.max() < 3 * max(worst for worst, _ in theirs)
+    assert np.median(errors) < 3 * max(middle for _, middle in theirs)
+    assert error_of_rebound("whfast")[0] > 1000 * errors.max()
