@@ -178,13 +178,13 @@ class _Splitting(CompositionMethod):
             return self.base
         return Geodesic(self.geodesic_steps)
 
-    def project(self, equations, place, q, p, h, infos) -> State:
-        """p in the tangent space after a part O over h at a `place`; its status is appended."""
+    def project(self, equations, time, q, p, duration, infos) -> State:
+        """p in the tangent space after a part O at this time; its status is appended."""
         if equations.system.constraint is None:
             return p
         # In the metric of the masses: p has the distribution of Maxwell of the tangent momenta.
-        weight = equations.system.noise.reaction(equations.args, p, h)
-        p, info = tangent(equations, place, q, p, weight)
+        weight = equations.system.noise.reaction(equations.args, p, duration)
+        p, info = tangent(equations, time, q, p, weight)
         infos.append(judge(info, q, p))
         return p
 

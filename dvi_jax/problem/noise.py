@@ -108,8 +108,8 @@ class Ito(MomentumNoise):
         def change(unit):
             """Σ_j σ_jm ∂σ_m/∂p_j of the motion with this unit vector."""
 
-            def column(p):
-                return MomentumNoise.force(self, t, q, p, args, unit)
+            def column(momentum):
+                return MomentumNoise.force(self, t, q, momentum, args, unit)
 
             return jax.jvp(column, (p,), (column(p),))[1]
 
