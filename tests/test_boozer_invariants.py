@@ -129,6 +129,7 @@ def test_second_invariant_of_wells_with_many_minima(make, point):
     assert minima >= 4
 
 
+@pytest.mark.slow
 def test_gradient_of_the_second_invariant():
     """In the point, μ, E and the modes, against differences of fourth order of the integral of
     scipy, and for the modes of second order."""

@@ -30,7 +30,7 @@ problem = lambda: Problem("slow", system, q0=[1.0], p0=[0.0], h=0.1, observables
 """
 
 
-@pytest.mark.parametrize("system", ["system", "problem"])
+@pytest.mark.parametrize("system", [pytest.param("system", marks=pytest.mark.slow), "problem"])
 def test_functions_of_the_slow_time_in_a_file(tmp_path, monkeypatch, system):
     """The system and InSlowTime receive τ = εt, other functions t, as in Python."""
     monkeypatch.chdir(tmp_path)

@@ -85,6 +85,7 @@ def test_rounding_does_not_accumulate_in_any_mode(mode):
     assert np.abs(apart).max() < 3e-10
 
 
+@pytest.mark.slow
 def test_the_energy_of_a_million_observed_steps():
     options = {"h": H, "num_steps": 10**6, "method": dvi.WisdomHolman()}
     save, drift = dvi.Save(final=True), dvi.MaxDrift(ENERGY)

@@ -236,7 +236,10 @@ def planets(tests=1):
     return Keplerian(a, e, inc, *rng.uniform(-3, 3, (3, count)))
 
 
-@pytest.mark.parametrize("frame", ["jacobi", "heliocentric", "barycentric"])
+@pytest.mark.parametrize(
+    "frame",
+    ["heliocentric", *(pytest.param(x, marks=pytest.mark.slow) for x in ("jacobi", "barycentric"))],
+)
 def test_elements_of_bodies_there_and_back(frame):
     elements = planets()
     q, p = to_bodies(elements, MASSES, MU, frame=frame)
@@ -305,7 +308,7 @@ def test_elements_of_a_solution_of_bodies():
 @pytest.mark.parametrize("method", [
     pytest.param(dvi.WisdomHolman(), marks=pytest.mark.slow),
     pytest.param(dvi.WisdomHolman(corrector=5), marks=pytest.mark.slow),
-    dvi.WisdomHolman("democratic"),
+    pytest.param(dvi.WisdomHolman("democratic"), marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_test_particles_in_wisdom_holman(method):
     """The massive bodies move as without them, and they as in another method, with its order."""

@@ -10,8 +10,8 @@ T = np.arange(300)
 RATES = {"fast decay": 0.01, "decay": 0.005, "slow decay": 0.002, "growth": -0.006}
 
 
-@pytest.mark.parametrize("count", [2, 8])
-@pytest.mark.parametrize("is_real", [True, False])
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 8])
+@pytest.mark.parametrize("is_real", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_strongest_line_of_a_damped_signal(count, is_real):
     """Against the frequency and the amplitude that it was made with; a weak line is far off."""
     omega, bin = 2 * np.pi * 0.2137, 2 * np.pi / len(T)

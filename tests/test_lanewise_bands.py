@@ -121,7 +121,7 @@ def check_random(seed):
         assert np.max(np.abs(found - exact)) <= 1e-13 * np.linalg.cond(J) * size
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2))])
 def test_random_equations(seed):
     check_random(seed)
 
@@ -166,7 +166,7 @@ def run(H_D, n, form="auto", **options):
         (chain, {"root_finder": dvi.Newton()}),
         (ring, {"root_finder": dvi.Newton()}),
         # The stages are far from each other in the vector of unknowns.
-        (chain, {"method": dvi.GaussLegendre(2), "h": 1.0}),
+        pytest.param(chain, {"method": dvi.GaussLegendre(2), "h": 1.0}, marks=pytest.mark.slow),
         # Picard's iteration diverges: Newton's method, in a branch, with a full matrix.
         (everyone, {"method": dvi.GaussLegendre(1), "h": 3.0}),
     ],

@@ -62,7 +62,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow) if x == "square" else x for x in CASES]
+)
 def test_products_are_those_of_numpy(name):
     function, *shapes = CASES[name]
     x, *args = (array(*shape) for shape in shapes)

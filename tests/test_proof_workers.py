@@ -55,6 +55,7 @@ def started(monkeypatch):
     assert all(process.returncode is not None for process in found)
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_number_of_processes(one, started):
     assert one.boxes > 30
     assert one.certificate["shell"]

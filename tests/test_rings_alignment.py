@@ -328,9 +328,9 @@ RINGS_IN_6D = {"phase of π": {"phase": np.pi}, "lag": {"lag": 1.0}}
 
 @pytest.mark.parametrize(
     "name",
-    ["roll 0.1", "solenoid", "exact bend", "pole faces", "phase of π",
+    ["roll 0.1", "pole faces",
      *(pytest.param(n, marks=pytest.mark.slow)
-       for n in ("roll −0.3", "tilt", "roll 2.5", "gap", "gradient", "moved", "edges", "hard edges",
+       for n in ("solenoid", "exact bend", "phase of π", "roll −0.3", "tilt", "roll 2.5", "gap", "gradient", "moved", "edges", "hard edges",
                  "lag"))],
 )  # fmt: skip
 def test_the_rounding_of_many_turns_has_no_sign(name):

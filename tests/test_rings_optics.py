@@ -273,9 +273,14 @@ def with_defocusing(magnet, drift=2.0, k=0.6):
     "errors",
     [
         {"roll": np.pi / 2},
-        {"roll": 3 * np.pi / 2, "ds": 1e-9},
-        {"tilt": -np.pi / 2},
-        {"roll": np.pi / 4, "tilt": np.pi / 4},
+        *(
+            pytest.param(errors, marks=pytest.mark.slow)
+            for errors in (
+                {"roll": 3 * np.pi / 2, "ds": 1e-9},
+                {"tilt": -np.pi / 2},
+                {"roll": np.pi / 4, "tilt": np.pi / 4},
+            )
+        ),
     ],
 )
 def test_the_tune_of_a_rolled_magnet_is_that_of_the_same_magnet_described_otherwise(errors):
