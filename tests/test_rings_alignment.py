@@ -330,8 +330,8 @@ RINGS_IN_6D = {"phase of π": {"phase": np.pi}, "lag": {"lag": 1.0}}
     "name",
     ["roll 0.1", "pole faces",
      *(pytest.param(n, marks=pytest.mark.slow)
-       for n in ("solenoid", "exact bend", "phase of π", "roll −0.3", "tilt", "roll 2.5", "gap", "gradient", "moved", "edges", "hard edges",
-                 "lag"))],
+       for n in ("solenoid", "exact bend", "phase of π", "roll −0.3", "tilt", "roll 2.5", "gap",
+                 "gradient", "moved", "edges", "hard edges", "lag"))],
 )  # fmt: skip
 def test_the_rounding_of_many_turns_has_no_sign(name):
     """The actions of small amplitudes are constant. A rotation whose c² + s² is not 1 changes all
