@@ -343,7 +343,7 @@ def _next_jump(
     with_jump = Part(
         *(*origin, t1, *state),  # pyright: ignore[reportCallIssue]
         *(jnp.where(is_next, -jnp.finfo(t.dtype).tiny, at_start), at_end, rises, falls),
-        jnp.where(numbers == index, fraction + _quiet(q), part.quiet),
+        jnp.where(numbers == index, fraction + _quiet(q), part.quiet),  # pyright: ignore[reportCallIssue]
         *(new[2], part.info.then(info).then(last), is_end | is_new_end, part.number + is_made),
     ).status(_of_values(values, at_start, at_end))
     # Without a jump: a point that cannot be computed ends the run; a surface that was passed at the

@@ -150,6 +150,7 @@ def take_step(
     # The part of the step without a jump, in which a run may stop.
     last = Ends(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
     if jumps is not None:
+        # Observables and a `Stop` receive the parameters after the last jump.
         last = jumps[0].ends
         task = task.with_args(carry := carry._replace(args=jumps[0].args))
     result, stop = _stop(task, carry, last, result)
@@ -213,6 +214,8 @@ def _after_jumps(
 
         return lax.scan(add, state, records)[0]
 
+    # Outside of the step itself, whose derivative is zero where it fails: rows of earlier jumps
+    # keep theirs. In a branch, because without it the rows would be copied in each step.
     state = t0, carry.q, carry.p, memory, carry.reductions
     state = lax.cond(lanewise.on_any(part.number > 0), write, lambda state: state, state)
     carry_after_jumps = carry._replace(reductions=state[4], jumps=state[3])
