@@ -111,6 +111,20 @@ def test_the_order_is_kept_with_forces_and_softening(mass):
     np.testing.assert_allclose(errors[:-1] / errors[1:], 4, atol=0.5)
 
 
+@pytest.mark.slow
+def test_another_scheme_is_more_accurate():
+    """Its parts have lengths that are rounded, some of them negative: the step failed with them."""
+
+    def end(steps, method):
+        return dvi.integrate(TWO, h=6.0 / steps, num_steps=steps, method=method, save=END).q_final
+
+    exact = end(24_000, dvi.KahanLi(8))
+    method = dvi.WisdomHolman("democratic", encounters=1e3, scheme=dvi.Yoshida(4))
+    errors = np.array([np.abs(end(steps, method) - exact).max() for steps in (20, 40)])
+    assert errors[0] / errors[1] > 5  # 4 with the order 2
+    assert errors[1] < 2e-7
+
+
 def loss_with(adjoint):
     def loss(x):
         """Of a state after the encounter, by the initial state and the masses."""
