@@ -1,5 +1,7 @@
 """Close encounters in `WisdomHolman`: reversible switching, energy, order, batches, derivatives."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -119,7 +121,8 @@ def test_another_scheme_is_more_accurate():
         return dvi.integrate(TWO, h=6.0 / steps, num_steps=steps, method=method, save=END).q_final
 
     exact = end(24_000, dvi.KahanLi(8))
-    method = dvi.WisdomHolman("democratic", 0, dvi.Yoshida(4), encounters=1e3)
+    choice: Any = {"scheme": dvi.Yoshida(4), "encounters": 1e3}
+    method = dvi.WisdomHolman("democratic", **choice)
     errors = np.array([np.abs(end(steps, method) - exact).max() for steps in (20, 40)])
     assert errors[0] / errors[1] > 5  # 4 with the order 2
     assert errors[1] < 2e-7
