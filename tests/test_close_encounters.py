@@ -1,5 +1,7 @@
 """Close encounters in `WisdomHolman`: reversible switching, energy, order, batches, derivatives."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -109,6 +111,21 @@ def test_the_order_is_kept_with_forces_and_softening(mass):
     errors = np.array([np.abs(q - exact).max() for q, _ in found])
     assert min(count for _, count in found) > 10
     np.testing.assert_allclose(errors[:-1] / errors[1:], 4, atol=0.5)
+
+
+@pytest.mark.slow
+def test_another_scheme_is_more_accurate():
+    """Its parts have lengths that are rounded, some of them negative: the step failed with them."""
+
+    def end(steps, method):
+        return dvi.integrate(TWO, h=6.0 / steps, num_steps=steps, method=method, save=END).q_final
+
+    exact = end(24_000, dvi.KahanLi(8))
+    choice: Any = {"scheme": dvi.Yoshida(4), "encounters": 1e3}
+    method = dvi.WisdomHolman("democratic", **choice)
+    errors = np.array([np.abs(end(steps, method) - exact).max() for steps in (20, 40)])
+    assert errors[0] / errors[1] > 5  # 4 with the order 2
+    assert errors[1] < 2e-7
 
 
 def loss_with(adjoint):
