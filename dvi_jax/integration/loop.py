@@ -70,6 +70,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     good = result == RESULTS.successful
     # A typed zero: the carry of a scan must not change its type, and a Python integer would.
     zero = jnp.asarray(0, jnp.int32)
+    counts = task.method.count(task.equations, interval, *lax.stop_gradient((q0, p0, q0, p0)))
     carry = Carry(
         k=zero,
         q=or_nan(good, q0),
@@ -85,7 +86,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         stop=stop,
         jumps=first_memory(task, q0, p0) if task.jumps else None,
         args=jax.tree.map(jnp.asarray, task.args) if task.changes_args else None,
-        counts=jax.tree.map(jnp.zeros_like, _counts(task, interval, q0, p0, q0, p0)),
+        counts=jax.tree.map(jnp.zeros_like, counts),
     )
     in_loop = _in_loop(task, q0)
     if in_loop is None:
@@ -170,7 +171,8 @@ def take_step(
         # Reductions cover the steps before the one in which the run stopped.
         is_end = new.result == RESULTS.stopped
         memories = jax.tree.map(lambda a, b: jnp.where(is_end, b, a), memories, carry.reductions)
-    counts = _counts(task, interval, carry.q, carry.p, new.q, new.p)
+    states = lax.stop_gradient((carry.q, carry.p, new.q, new.p))
+    counts = task.method.count(task.equations, interval, *states)
     new = new._replace(
         k=carry.k + 1,
         # The memory of the last good step, for the report: that of a failed one may be NaN.
@@ -180,10 +182,7 @@ def take_step(
         reductions=memories,
         remainder=remainder,
         stop=stop,
-        counts={
-            name: jnp.where(good, total + counts[name], total)
-            for name, total in carry.counts.items()
-        },
+        counts=jax.tree.map(lambda old, x: jnp.where(good, old + x, old), carry.counts, counts),
     )
     return new, interval, Ends(*interval[:2], carry.q, carry.p, new.q, new.p)
 
@@ -226,11 +225,6 @@ def _start_number(k: Array, has_jumped: Array) -> Array:
     """The number of a step in reductions that keep steps; of a part after a jump that of the first,
     which may begin on a surface without a crossing."""
     return jnp.where(has_jumped, 0, k)
-
-
-def _counts(task: Task, interval: Interval, *states: State) -> dict[str, Array]:
-    """The numbers that the method reports of a step, without a derivative."""
-    return task.method.count(task.equations, interval, *lax.stop_gradient(states))
 
 
 def _with_failure(
