@@ -331,8 +331,8 @@ def _next_jump(
     # Where no jump is made the step from the start of the part is repeated, which is always finite:
     # a step of length zero may not be, and zero times its derivative would be NaN.
     origin: Any = where(is_made, (fraction, t, *new[:2]), part[:4])
-    rest = Interval(origin[1], interval.t1, (1 - origin[0]) * interval.h)
-    q1, p1, last = task.method.step(equations, rest, *origin[2:])
+    interval_after = Interval(origin[1], interval.t1, (1 - origin[0]) * interval.h)
+    q1, p1, last = task.method.step(equations, interval_after, *origin[2:])
     last = info_of(task.method, last, q1, p1)
     at_start, rises = _with_slopes(task, equations, *origin[1:])
     at_end, falls = _with_slopes(task, equations, interval.t1, q1, p1)
@@ -376,8 +376,8 @@ def _image(task: Task, map: Callable[..., Any], *point: Any) -> tuple:
     """(q, p, args) after a jump, of the types before it; args are None if no jump changes them."""
     _, q0, p0, args = point
     old = q0, p0, args if task.changes_args else None
-    q1, p1, *rest = map(*point)
-    new = q1, p1, rest[0] if rest else old[2]
+    q1, p1, *parameters = map(*point)
+    new = q1, p1, parameters[0] if parameters else old[2]
     return jax.tree.map(lambda value, like: jnp.asarray(value, like.dtype), new, old)
 
 

@@ -96,6 +96,7 @@ class _Motion(NamedTuple):
 
     def acceleration(self, t: Scalar, q: State, v: State) -> State:
         a = _cross(self.turning(t, q), v) + self.at_rest(t, q)
+        # x − x is not 0 in compiled code, where x may be NaN.
         if not self.has_friction(t, q):
             return a
         return a + (self.friction(t, q, v) - self.friction(t, q, jnp.zeros_like(v)))
@@ -126,6 +127,7 @@ class _ChargedMethod(SplittingMethod):
     def check(self, equations, first_interval, q, p):
         interval = first_interval()
         motion, (q, p) = _Motion.of(equations, interval, q), equations.absolute(q, p)
+        # At the state of the user: traced ones are not known, and a program without it is faster.
         t, name, mass = interval.t0, type(self).__name__, np.asarray(motion.mass)
         v = motion.velocity(t, q, p)
         rtol = 1e5 * float(jnp.finfo(q.dtype).eps)
@@ -236,6 +238,7 @@ class Boris(_ChargedMethod):
                 middle, info = _middle(rate, h, start, equations.newton)
             else:
                 middle = _middle_of_rotation(h / 2 * motion.turning(t, place), start)
+            # Not 2·middle − v: the change alone has the digits that a compensated sum keeps.
             v = v + h * rate(middle)
             return q, v, judge(info, q, v)
 
@@ -301,6 +304,8 @@ class MagneticSplitting(_ChargedMethod):
 
         def clock(interval, q, v):
             place, _ = equations.absolute(q, v)
+            # A changes in time, and p does not: the velocity changes. The flow of φ would have to
+            # contain −∂A/∂t instead, which is no gradient, and would not be symplectic.
             p = motion.momentum(interval.t0, place, v)
             v = v + (
                 motion.velocity(interval.t1, place, p) - motion.velocity(interval.t0, place, p)
@@ -324,6 +329,8 @@ class MagneticSplitting(_ChargedMethod):
             v = v + interval.h * motion.push(interval.t0, place)
             return q, v, judge(no_solve(q), q, v)
 
+        # Time has a flow of its own only if something depends on it, since one more takes longer.
+        # The first flow carries the time, and is exact only for what does not depend on it.
         flows = [*(partial(axis_flow, i) for i in range(q.shape[-1])), kick]
         if depends_on(lambda t: motion.acceleration(t, q, q), 0, t0):
             flows = [clock, *flows]

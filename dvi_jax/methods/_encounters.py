@@ -35,9 +35,9 @@ _MOST = 10_000
 def _extrapolation(counts: np.ndarray) -> np.ndarray:
     """The weights of results with n steps, whose errors are series in 1/n²."""
     squares = counts * counts
-    others = ~np.eye(len(counts), dtype=bool)
-    differences = np.where(others, squares[:, None] - squares, 1)
-    return np.where(others, squares[:, None] / differences, 1).prod(axis=1)
+    is_different = ~np.eye(len(counts), dtype=bool)
+    differences = np.where(is_different, squares[:, None] - squares, 1)
+    return np.where(is_different, squares[:, None] / differences, 1).prod(axis=1)
 
 
 _WEIGHTS = _extrapolation(_SUBSTEPS)
@@ -72,8 +72,8 @@ class Encounters(NamedTuple):
         def with_pairs(kepler):
             dX, dV, defect = _differentiable(_motion, [*self, h, X, V])
             is_member = jnp.any(self.close, axis=1)[:, None]
-            moved = (jnp.where(is_member, *pair) for pair in zip((dX, dV), kepler, strict=False))
-            return *moved, kepler[2] & (defect == 0)
+            motion = (jnp.where(is_member, *pair) for pair in zip((dX, dV), kepler, strict=False))
+            return *motion, kepler[2] & (defect == 0)
 
         return self._if_any(with_pairs, kepler)
 
@@ -91,8 +91,8 @@ def close_pairs(h: Scalar, X: Array, V: Array, radii: Array) -> Bool[Array, "n n
     limit = jnp.abs(h) / 2
     time = jnp.clip(-xv / jnp.where(v2 > 0, v2, 1), -limit, limit)[..., None]
     nearest = jnp.sum((x + time * v) ** 2, axis=-1)
-    near = nearest < jnp.maximum(radius[:, None], radius[None]) ** 2
-    return near & ~jnp.eye(len(X), dtype=bool)
+    is_close = nearest < jnp.maximum(radius[:, None], radius[None]) ** 2
+    return is_close & ~jnp.eye(len(X), dtype=bool)
 
 
 def _motion(*operands: Array) -> list[Array]:

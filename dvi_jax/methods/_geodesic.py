@@ -74,6 +74,7 @@ class Geodesic(Method):
 
     def _motion(self, equations, interval, q, p) -> tuple[Equations, Method]:
         """The equations of A and its method; those of the whole step if H_D is not separable."""
+        # The motion with H = K(p, q) has no flow with steps of its own: the kick depends on p.
         if not is_separable(equations, interval, interval, q, p):
             return equations, Rattle()
         free = dataclasses.replace(equations, system=_FreeMotion(equations.system))

@@ -214,8 +214,8 @@ class _Splitting(CompositionMethod):
     def inverse(self, equations, interval, q1, p1):
         # The parts are symmetric: back along the path, they are the step by −h with −dB.
         if (dB := equations.increments) is not None:
-            back = jnp.stack([-dB[0], dB[1]]) if self.needs_areas else -dB[::-1]
-            equations = dataclasses.replace(equations, increments=back)
+            reversal = jnp.stack([-dB[0], dB[1]]) if self.needs_areas else -dB[::-1]
+            equations = dataclasses.replace(equations, increments=reversal)
         return self.step(equations, interval.reversed(), q1, p1)
 
 
@@ -317,14 +317,17 @@ class StrongSplitting(_Splitting):
             t = interval.part(number / 2, 1.0).t0
             place = _place(equations, t, q, p)
             noise.check_fixed_momentum(type(self).__name__, *place)
-            rest = (*place[:2], jnp.zeros_like(p), place[3])  # the force of noise alone
+            # At p = 0 the friction vanishes: this is the force of the noise alone.
+            place_of_noise = *place[:2], jnp.zeros_like(p), place[3]
 
             def friction(p, noise=noise):
                 damping = noise.kick(*place[:2], p, place[3], quarter, jnp.zeros_like(kick))
                 return self.project(equations, t, q, p + damping, quarter, infos)
 
             p = friction(p) if number > 0 else p
-            p = self.project(equations, t, q, p + noise.force(*rest, kick), 0 * quarter, infos)
+            p = self.project(
+                equations, t, q, p + noise.force(*place_of_noise, kick), 0 * quarter, infos
+            )
             return friction(p) if number < 2 else p
 
         q, p = q0, part(0, q0, p0)

@@ -274,16 +274,16 @@ class WisdomHolman(SplittingMethod):
 
     def _check_attraction(self, equations, interval, q, p, scale):
         """**Raises** `ValueError` if bodies next to one another do not attract by Newton's law."""
-        others, unit = np.arange(len(q) - 1), np.linalg.norm(np.asarray(q[1] - q[0]))
+        numbers, unit = np.arange(len(q) - 1), np.linalg.norm(np.asarray(q[1] - q[0]))
         x = np.array(q)
-        x[1:] = x[1] + 1e-6 * unit * others[:, None]
+        x[1:] = x[1] + 1e-6 * unit * numbers[:, None]
         x = jnp.asarray(x)
-        pairs = self._pairs(equations, interval, x, ~jnp.eye(len(others), dtype=bool))
+        pairs = self._pairs(equations, interval, x, ~jnp.eye(len(numbers), dtype=bool))
         pull = np.asarray(pairs.pull(x[1:]))
-        rest = np.asarray(equations.momentum_rate(interval, x, p) / scale)[1:] - pull
+        difference = np.asarray(equations.momentum_rate(interval, x, p) / scale)[1:] - pull
         size, of_first = np.abs(pull).max(), float(pairs.mu[0]) / unit**2
         # Where the attraction is so small that the first body hides it, it is not compared.
-        if size > 100 * of_first and np.abs(rest).max() > 0.1 * size:
+        if size > 100 * of_first and np.abs(difference).max() > 0.1 * size:
             raise ValueError(
                 "encounters of dvi.WisdomHolman requires bodies that attract one another by "
                 "Newton's law with the masses and G of the Kepler orbits, but they do not."
@@ -306,16 +306,16 @@ class WisdomHolman(SplittingMethod):
         def attempt(state):
             close, *_ = state
             q1, p1, info = compose(self.parts(equations, interval, q, close))
-            both = close | self._close(equations, interval, q1, p1)
-            return both, jnp.all(both == close), q1, p1, info
+            pairs = close | self._close(equations, interval, q1, p1)
+            return pairs, jnp.all(pairs == close), q1, p1, info
 
         def repeat(state, _):
             is_final = state[1]
 
-            def again():
+            def repetition():
                 return jax.tree.map(lambda a, b: jnp.where(is_final, a, b), state, attempt(state))
 
-            return lax.cond(lanewise.on_any(~is_final, rare=False), again, lambda: state), None
+            return lax.cond(lanewise.on_any(~is_final, rare=False), repetition, lambda: state), None
 
         # Pairs are judged at both ends: with one that is close at the end only, the step is
         # repeated from its start.

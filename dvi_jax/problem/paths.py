@@ -120,7 +120,7 @@ class Brownian(BrownianPath):
 
             B, integral = lax.fori_loop(0, cells, add, (zero, zero))
             x = x - last
-            b, inner = _inside(self.key, first + last.astype(jnp.uint32), x, count, dtype)
+            b, inner = _interior(self.key, first + last.astype(jnp.uint32), x, count, dtype)
             return B + b, integral + B * x + inner
 
         points = [(zero, zero), *(at(size * (i + 1) / parts) for i in range(parts))]
@@ -163,14 +163,14 @@ class NoisePath(eqx.Module):
         """The increments of step k, shape (parts, count); the areas are further rows."""
         rows = [self._rows("increments", k, interval)]
         rows += [self._rows("areas", k, interval)] if self.has_areas else []
-        return self._limited(jnp.concatenate(rows), interval)
+        return self._truncation(jnp.concatenate(rows), interval)
 
     def increments_within(self, k: Int[Array, ""], interval: Interval, fraction: Scalar) -> Array:
         """The same over the first `fraction` of step k; those of the step to the bit at its end."""
         rows = self.path.part(k, interval, fraction, self.parts, self.count)
         assert rows is not None  # checked before the run
         rows = jnp.concatenate(rows[: 1 + self.has_areas]).astype(interval.h.dtype)
-        rows = self._limited(rows, interval._replace(h=fraction * interval.h))
+        rows = self._truncation(rows, interval._replace(h=fraction * interval.h))
         return jnp.where(fraction == 1, self.increments_of(k, interval), rows)
 
     def _rows(self, name: str, k: Int[Array, ""], interval: Interval) -> Array:
@@ -179,7 +179,8 @@ class NoisePath(eqx.Module):
         array(text, rows, (self.parts, self.count), integers=True)
         return rows.astype(interval.h.dtype)  # a path of the user may have another type
 
-    def _limited(self, increments: Array, interval: Interval) -> Array:
+    def _truncation(self, increments: Array, interval: Interval) -> Array:
+        # A method that solves for the state may have no root for an increment that is rare.
         if self.limit is None:
             return increments
         largest = self.limit * jnp.sqrt(jnp.abs(interval.h))
@@ -219,7 +220,7 @@ _HALVINGS = 24
 """Of a substep, for a point in it: between the last ones the path is a straight line."""
 
 
-def _inside(key: Array, number: Array, x: Scalar, count: int, dtype: Any) -> tuple[Array, Array]:
+def _interior(key: Array, number: Array, x: Scalar, count: int, dtype: Any) -> tuple[Array, Array]:
     """B and ∫ B dx at 0 ≤ x ≤ 1 of the path with unit step and this number."""
 
     # The increment w and the area c of an interval give those of its halves with two normals more
