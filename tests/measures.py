@@ -38,7 +38,7 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 17_100,
+    "lines of the core": 17_110,
     "lines of the questions": 22_460,
     "lines of the leaves": 22_230,
     "lines of lanewise": 12_700,
@@ -57,7 +57,7 @@ LIMITS: dict[str, float] = {
 the lines of a part, by its own size."""
 
 COMMENTS = "lines of the core with a comment, per cent"
-LEAST = {COMMENTS: 4.9}
+LEAST = {COMMENTS: 5.0}
 """What must not become less."""
 
 

@@ -54,6 +54,7 @@ class _Motion(NamedTuple):
                 "methods for charged particles require H_D = Σ |p − A(q)|²/(2m) + φ(q), but it is "
                 "not quadratic in p1."
             )
+        # One mass of a particle, that of its first component: `check` compares the others with it.
         inverse = inverse_mass(q)
         return cls(in_full, jnp.zeros_like(interval.h), 1 / inverse, inverse)
 
@@ -81,6 +82,7 @@ class _Motion(NamedTuple):
     def at_rest(self, t: Scalar, q: State) -> State:
         """a at v = 0."""
         p = self.momentum(t, q, jnp.zeros_like(q))
+        # The induced electric field: A changes in time, at constant p.
         _, induction = jax.jvp(lambda t: self.velocity(t, q, p), (t,), (jnp.ones_like(t),))
         return induction + self.push(t, q)
 
@@ -122,6 +124,7 @@ class _ChargedMethod(SplittingMethod):
     def leave(self, equations, interval, q, p):
         motion = _Motion.of(equations, interval, q)
         place, zero = equations.absolute(q, jnp.zeros_like(p))
+        # Relative to the origin again, where there is one.
         return q, motion.momentum(interval.t1, place, p) - zero, no_step_yet(q)
 
     def check(self, equations, first_interval, q, p):
@@ -156,6 +159,7 @@ def _drift(interval: Interval, q: State, v: State):
 
 def _middle_of_rotation(turn: Array, start: State) -> State:
     """v = start + turn × v."""
+    # The inverse of 1 − turn ×, Cayley's form of a rotation.
     v = start + _cross(turn, start)
     if start.shape[-1] == 3:
         v = v + turn * jnp.sum(turn * start, axis=-1, keepdims=True)
@@ -227,9 +231,11 @@ class Boris(_ChargedMethod):
 
     def parts(self, equations, interval, q):
         motion = _Motion.of(equations, interval, q)
+        # Decided before the step is compiled: without a friction it has a closed form.
         has_friction = motion.has_friction(interval.t0, q)
 
         def turn(interval, q, v):
+            # Fields at the middle of the step make it symmetric in time.
             t, h = (interval.t0 + interval.t1) / 2, interval.h
             place, _ = equations.absolute(q, v)
             start, info = v + h / 2 * motion.at_rest(t, place), no_solve(v)
@@ -315,6 +321,7 @@ class MagneticSplitting(_ChargedMethod):
         def axis_flow(i, interval, q, v):
             place, _ = equations.absolute(q, v)
             axis = np.arange(q.shape[-1]) == i
+            # A straight line at constant speed: the field along it turns the other components only.
             path = jnp.where(axis, interval.h * v, 0.0)
             # A value at each node of the path, on which the field differs.
             fields = [
@@ -326,6 +333,7 @@ class MagneticSplitting(_ChargedMethod):
 
         def kick(interval, q, v):
             place, _ = equations.absolute(q, v)
+            # At v = 0, since the magnetic field belongs to the flows of the axes.
             v = v + interval.h * motion.push(interval.t0, place)
             return q, v, judge(no_solve(q), q, v)
 

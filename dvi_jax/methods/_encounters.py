@@ -57,6 +57,7 @@ class Encounters(NamedTuple):
         """The accelerations by the attraction of close pairs."""
         difference = x[:, None] - x[None]
         square = jnp.sum(difference * difference, axis=-1) + self.softening
+        # Other pairs may be at one place, a body with itself, where the derivative would be NaN.
         square = jnp.where(self.close, square, 1)
         weight = jnp.where(self.close, -self.masses[None] / (square * jnp.sqrt(square)), 0)
         return jnp.sum(weight[..., None] * difference, axis=1)
@@ -78,6 +79,7 @@ class Encounters(NamedTuple):
         return self._if_any(with_pairs, kepler)
 
     def _if_any(self, function: Callable, values: Any) -> Any:
+        # In most steps no pair is close: a batch skips this work where none of its runs has one.
         return lax.cond(lanewise.on_any(jnp.any(self.close)), function, lambda x: x, values)
 
 
@@ -136,9 +138,11 @@ def _motion(*operands: Array) -> list[Array]:
         zero = jnp.zeros((2, *x.shape), x.dtype)
         (change, error), _ = lax.scan(add, (zero, zero), rows)
         scale = _size(jnp.stack([v, rate])) * jnp.abs(step) + _size(change)
+        # Of each body relative to its own change: a slow or distant one has small numbers.
         error = jnp.max(_size(error) / jnp.where(scale > 0, scale, 1))
         is_finite = jnp.all(jnp.isfinite(change))
         is_good = is_finite & (error <= tolerance)
+        # The estimate has the order 10, so that an error changes with the power 11 of the substep.
         ratio = tolerance / jnp.maximum(error, tolerance / 4.0**11)
         factor = jnp.where(is_finite, jnp.clip(0.9 * ratio ** (1 / 11), 0.1, 4.0), 0.1)
         take = jnp.where(is_good, change, 0)

@@ -275,6 +275,7 @@ class WisdomHolman(SplittingMethod):
     def _check_attraction(self, equations, interval, q, p, scale):
         """**Raises** `ValueError` if bodies next to one another do not attract by Newton's law."""
         numbers, unit = np.arange(len(q) - 1), np.linalg.norm(np.asarray(q[1] - q[0]))
+        # All of them next to the second body, where their attraction exceeds that of the first one.
         x = np.array(q)
         x[1:] = x[1] + 1e-6 * unit * numbers[:, None]
         x = jnp.asarray(x)
@@ -295,6 +296,7 @@ class WisdomHolman(SplittingMethod):
         frame, scale = self._frame(equations, interval, q)
         position, momentum = equations.absolute(jnp.zeros_like(q), jnp.zeros_like(q))
         X, V = q + frame.from_bodies(position), p + frame.velocities_of(momentum / scale)
+        # Radii of Hill spheres, in units of the distance to the first body.
         radii = self.encounters * jnp.cbrt(frame.masses[1:] / (3 * frame.masses[0]))
         return close_pairs(interval.h, X[1:], V[1:], radii)
 
