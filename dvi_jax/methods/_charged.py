@@ -131,6 +131,7 @@ class _ChargedMethod(SplittingMethod):
         interval = first_interval()
         motion, (q, p) = _Motion.of(equations, interval, q), equations.absolute(q, p)
         # At the state of the user: traced ones are not known, and a program without it is faster.
+        # The velocity of a particle must be (p − A)/m: put into p = m v + A, it gives p again.
         t, name, mass = interval.t0, type(self).__name__, np.asarray(motion.mass)
         v = motion.velocity(t, q, p)
         rtol = 1e5 * float(jnp.finfo(q.dtype).eps)

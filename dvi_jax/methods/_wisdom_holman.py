@@ -269,6 +269,7 @@ class WisdomHolman(SplittingMethod):
         mu = self._strength(equations, q) * frame.central_mass()
         args = equations.args if isinstance(equations.args, dict) else {}
         softening = jnp.asarray(args.get("softening", 0), q.dtype)
+        # G m of each body, from μ of its orbit: G may be a function of the user.
         masses = frame.masses[1:] / frame.masses[0] * mu
         return Encounters(masses, mu, softening * softening, close)
 
