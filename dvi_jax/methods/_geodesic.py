@@ -55,6 +55,7 @@ class Geodesic(Method):
 
     def step(self, equations, interval, q0, p0):
         free, motion = self._motion(equations, interval, q0, p0)
+        # The method takes the whole step: no kick is left.
         if free is equations:
             return motion.step(equations, interval, q0, p0)
         p, before = self._kick(equations, interval, interval.h, q0, p0)
