@@ -181,6 +181,7 @@ def pictures(single):
     proved = SimpleNamespace(per_step=(0.2,), rounding=(0.0,), level=None, steps=0)
     flags = {"flag_values": [0, 1, 2, 3, 4, 5], "flag_meanings": "successful a b c d e"}
     data = xr.DataArray(t, dims="x", coords={"x": t}, name="drift", attrs=flags)
+    orbits = dvi.elements.Keplerian(t, t, t, t, t, t)
     history = {"stage": 0 * t, "loss": t, "accepted": t > 0, "horizon": t}
     fit = SimpleNamespace(
         whitened=[t[:, None]], ts=[t], chi2=1.0, degrees_of_freedom=3, has_errors=True,
@@ -226,6 +227,7 @@ def pictures(single):
         "fit_against_data": (1, lambda ax: plot.fit_against_data(fit, ax=ax)),
         "learning_curve": (1, lambda ax: plot.learning_curve(fit, ax=ax)),
         "planet_orbits": (2, lambda ax: plot.planet_orbits(*planets, ax=ax)),
+        "elements": (2, lambda ax: plot.elements(t, orbits, ("a", "e"), ax=ax)),
         "ephemeris_comparison": (3, lambda ax: plot.ephemeris_comparison(*errors, ax=ax)),
     }
 
@@ -249,7 +251,8 @@ def test_every_picture_draws_on_the_axes_it_is_given_and_on_nothing_else(single)
             with pytest.raises(ValueError, match=f"needs {count} Axes"):
                 draw(mine[:-1])
         plt.close(figure)
-        if name in ("orbit", "balance", "sweep_map", "fit_residuals", "ephemeris_comparison"):
+        several = "orbit", "balance", "sweep_map", "fit_residuals", "elements"
+        if name in (*several, "ephemeris_comparison"):
             assert np.size(draw(None)) == count, name
             plt.close("all")
 
