@@ -43,7 +43,7 @@ LIMITS: dict[str, float] = {
     "lines of the leaves": 22_230,
     "lines of lanewise": 12_700,
     "lines of the command line": 5_651,
-    "raise statements": 665,
+    "raise statements": 666,
     "characters of error text": 45_000,
     "functions with more than 9 parameters": 2,
     "files of more than 450 lines": 0,

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.checks import array, finite, instance, one_of, require
+from ..base.checks import array, finite, instance, require
 from ..base.indices import out_of_bounds
 from ..base.keywords import tracing_note
 from ..base.machine import refuse_fork
@@ -209,8 +209,11 @@ def of_problem(
 
 def without_jumps(problem: Any) -> Any:
     """The problem. **Raises** `ValueError` for one with jumps, which a call does not make."""
-    hint = "Only dvi.integrate makes jumps. Give problem.system for the motion between them."
-    one_of("jumps of a problem", tuple(getattr(problem, "jumps", ())), [()], hint)
+    if getattr(problem, "jumps", ()):
+        raise ValueError(
+            "the problem has jumps, such as bounces, and only dvi.integrate makes them: give "
+            "problem.system for the motion between jumps."
+        )
     return problem
 
 
