@@ -38,7 +38,7 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 17_115,
+    "lines of the core": 17_116,
     "lines of the questions": 22_460,
     "lines of the leaves": 22_230,
     "lines of lanewise": 12_700,

@@ -450,7 +450,7 @@ def test_a_problem_with_jumps_is_run_with_them_or_refused():
         lambda: dvi.explore(ball),
         lambda: dvi.interop.solve_ivp(ball, (0, 1), [1.0, 0.0], h=0.1),
     ):
-        with pytest.raises(ValueError, match=r"Only dvi\.integrate makes"):
+        with pytest.raises(ValueError, match=r"only dvi\.integrate makes"):
             call()
 
 

@@ -209,6 +209,7 @@ def of_problem(
 
 def without_jumps(problem: Any) -> Any:
     """The problem. **Raises** `ValueError` for one with jumps, which a call does not make."""
+    # Without them a ball would fall through the floor, and no number would show it.
     if getattr(problem, "jumps", ()):
         raise ValueError(
             "the problem has jumps, such as bounces, and only dvi.integrate makes them: give "
