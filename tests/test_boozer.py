@@ -251,6 +251,7 @@ def test_energy_error_scales_with_the_order_and_does_not_grow():
     assert long < 1.3 * short  # ten times as long: the energy oscillates
 
 
+@pytest.mark.slow
 def test_the_toroidal_momentum_is_conserved_in_an_axisymmetric_field():
     found = final("axisymmetric", [np.array(x) for x in ORBITS["axisymmetric"]], 0.8)
     change = np.abs(found.p / found.p0 - 1).max(axis=0)

@@ -153,6 +153,7 @@ def test_gradient_of_the_second_invariant():
     assert float(of_field.coefficients[place]) == pytest.approx(float(difference), rel=1e-7)
 
 
+@pytest.mark.slow
 def test_second_invariant_of_a_passing_particle_and_extremes_ignore_nan():
     assert np.isnan(compiled()(field(), 0.4, 0.3, 0.2, 0.3 / 5, 0.5)[0])
     well = jax.jit(boozer.well)

@@ -154,6 +154,7 @@ def test_gradients_are_those_of_the_pairs_taken(adjoint):
     assert abs(expected) > 1
 
 
+@pytest.mark.slow
 def test_a_motion_that_is_not_found_is_a_status(monkeypatch):
     monkeypatch.setattr(_encounters, "_MOST", 3)
     method = dvi.WisdomHolman("democratic", encounters=3.1)

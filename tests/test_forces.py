@@ -461,7 +461,7 @@ def test_relativity_of_all_bodies_is_that_of_reboundx():
     assert 1e-4 < np.abs(theirs - ours).max() / np.abs(theirs).max() < 5 / LIGHT**2
 
 
-@pytest.mark.parametrize("light", [LIGHT, 2 * LIGHT])
+@pytest.mark.parametrize("light", [LIGHT, pytest.param(2 * LIGHT, marks=pytest.mark.slow)])
 def test_the_two_forms_of_relativity_of_all_bodies(state, light):
     """The acceleration of Hamilton's equations is that of the force, up to O(1/c⁴)."""
     force, args = forces.PostNewtonian(light), {**ARGS, "masses": HEAVY}

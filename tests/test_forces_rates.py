@@ -60,7 +60,7 @@ def disturbing(degree, a, e, inc):
     return -EARTH / a * (RADIUS / a) ** degree * inclination * sums * (1 - e * e) ** (0.5 - degree)
 
 
-@pytest.mark.parametrize("degree", [2, 4, 6])
+@pytest.mark.parametrize("degree", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 6))])
 @pytest.mark.parametrize("orbit", [LAGEOS, LAGEOS._replace(a=26560.0, e=0.7, inc=1.1)])
 def test_mean_rates_of_node_and_perigee(degree, orbit):
     """Lagrange's equations of the mean potential, against the mean of the force on one orbit."""

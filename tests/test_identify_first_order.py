@@ -83,6 +83,7 @@ def test_the_order_of_the_integrator(stages):
     assert np.diff(np.log2(errors)) == pytest.approx(-2 * stages, abs=0.35)
 
 
+@pytest.mark.slow
 def test_two_arcs_at_irregular_times_with_missing_values():
     """The initial states are not given: they begin at the first observations."""
     arcs = []

@@ -57,6 +57,7 @@ def test_the_path_is_that_of_the_segments(target, centre, signs):
     assert np.isnan(edges).all(axis=1).tolist() == [1, 0, 0, 1]
 
 
+@pytest.mark.slow
 def test_velocities_and_a_run_with_a_third_body():
     path = interop.ephemeris_path(KERNEL, 301, 399, DATES, epoch=START)
     t, step = 1e6, 10.0

@@ -222,6 +222,7 @@ def axes(pole):
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
+@pytest.mark.slow
 def test_oblateness_is_minus_gm_j2_p2():
     args = {"masses": MASSES, "G": G, "J2": 0.02, "R": 0.4, "pole": 5 * POLE}
     r = Q[1:] - Q[0]
@@ -271,7 +272,9 @@ def oblate(inclination):
     return np.array([per_turn(q, v, turn) for q, v in zip(*map(np.asarray, runs), strict=True)])
 
 
-@pytest.mark.parametrize("inclination", [0.4, 1.3])  # below and above 63.4°, where ω is constant
+@pytest.mark.parametrize(
+    "inclination", [pytest.param(0.4, marks=pytest.mark.slow), 1.3]
+)  # below and above 63.4°, where ω is constant
 def test_oblateness_turns_node_and_pericentre(inclination):
     ci = np.cos(inclination)
     p2 = (1 - ECCENTRICITY**2) ** 2
