@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 import lanewise
 from lanewise.jaxprs.dependence import depends_on
+from lanewise.jaxprs.jaxapi import ClosedJaxpr, jaxpr_as_fun
 
 from ..base.checks import array, whole
 from ..base.types import Interval, Scalar, State
@@ -68,7 +69,7 @@ class _Motion(NamedTuple):
     def turning(self, t: Scalar, q: State) -> Array:
         """c, with one component if q has two."""
         zero, n = jnp.zeros_like(q), q.shape[-1]
-        units = [zero.at[..., i].set(1.0) for i in range(n)]
+        units = [jnp.broadcast_to(unit, q.shape) for unit in lanewise.unit_vectors(n, q.dtype)]
         # −A/m is the velocity for p = 0.
         slopes = [jax.jvp(lambda q: self.velocity(t, q, zero), (q,), (unit,))[1] for unit in units]
         pairs = [(0, 1)] if n == 2 else [(1, 2), (2, 0), (0, 1)]
@@ -76,8 +77,14 @@ class _Motion(NamedTuple):
 
     def push(self, t: Scalar, q: State) -> State:
         """(−∂φ/∂q + εW)/m, of W at rest."""
-        p = self.momentum(t, q, jnp.zeros_like(q))
-        return self.inverse_mass * self.equations.momentum_rate(Interval(t, t, self.zero), q, p)
+        p, equations = self.momentum(t, q, jnp.zeros_like(q)), self.equations
+        system, epsilon, args = equations.system, equations.epsilon, equations.args
+        phi = _potential(lambda q, p: system.hamiltonian(t, t, q, p, epsilon, args), q, p)
+        # With a quantum a rate has to have the bits that it has elsewhere.
+        if phi is None or equations.quantum is not None:
+            return self.inverse_mass * equations.momentum_rate(Interval(t, t, self.zero), q, p)
+        force = system.disturbing_force(t, t, q, p, epsilon, args)
+        return self.inverse_mass * (force - jax.grad(phi)(q))
 
     def at_rest(self, t: Scalar, q: State) -> State:
         """a at v = 0."""
@@ -97,18 +104,54 @@ class _Motion(NamedTuple):
         return depends_on(lambda v: self.friction(t, q, v), 0, q)
 
     def acceleration(self, t: Scalar, q: State, v: State) -> State:
-        a = _cross(self.turning(t, q), v) + self.at_rest(t, q)
+        a = _plus_cross(self.at_rest(t, q), self.turning(t, q), v)
         # x − x is not 0 in compiled code, where x may be NaN.
         if not self.has_friction(t, q):
             return a
         return a + (self.friction(t, q, v) - self.friction(t, q, jnp.zeros_like(v)))
 
 
-def _cross(turning: Array, v: State) -> State:
-    """The product with the vector `turning`; in a plane, with a vector normal to it."""
+def _potential(hamiltonian: Callable, q: State, p: State) -> Callable[[State], Scalar] | None:
+    """φ of H(q, p) = Σ (p − A(q))²/(2m) + φ(q), or None where the jaxpr does not show it.
+
+    The gradient of H at p = A(q) is that of φ too, but it contains the derivative of A times 0.
+    """
+    closed = jax.make_jaxpr(hamiltonian)(q, p)
+    jaxpr = closed.jaxpr
+
+    def uses(x):
+        return [eqn for eqn in jaxpr.eqns if any(x is atom for atom in eqn.invars)]
+
+    positions, momenta = jaxpr.invars
+    differences = uses(momenta)
+    if len(differences) != 1 or differences[0].primitive.name not in ("sub", "add"):
+        return None
+    (u,) = differences[0].outvars  # p ± A, which is used in squares only
+    squares = uses(u)
+    powers = ("integer_pow", "square", "mul", "dot_general")
+    if any(e.primitive.name not in powers or any(x is not u for x in e.invars) for e in squares):
+        return None
+    if u.aval.shape != p.shape or any(e.params.get("y", 2) < 2 for e in squares):
+        return None
+    rest = jaxpr.replace(
+        invars=[positions, u],
+        eqns=[eqn for eqn in jaxpr.eqns if eqn is not differences[0]],
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    function = jaxpr_as_fun(ClosedJaxpr(rest, closed.consts))
+    return lambda q: function(q, jnp.zeros(p.shape, u.aval.dtype))[0]
+
+
+def _plus_cross(start: State, turning: Array, v: State) -> State:
+    """start + turning × v; in a plane, with a vector normal to it."""
     if v.shape[-1] == 2:
-        return turning * jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
-    return jnp.cross(turning, v)
+        return start + turning * jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
+
+    def turned(x):  # (x, y, z) → (y, z, x)
+        return jnp.roll(x, -1, axis=-1)
+
+    # One sum after the other: each product becomes a fused multiply-add.
+    return start + turned(turning) * turned(turned(v)) - turned(turned(turning)) * turned(v)
 
 
 class _ChargedMethod(SplittingMethod):
@@ -158,13 +201,10 @@ def _drift(interval: Interval, q: State, v: State):
     return q, v, judge(no_solve(q), q, v)
 
 
-def _middle_of_rotation(turn: Array, start: State) -> State:
-    """v = start + turn × v."""
-    # The inverse of 1 − turn ×, Cayley's form of a rotation.
-    v = start + _cross(turn, start)
-    if start.shape[-1] == 3:
-        v = v + turn * jnp.sum(turn * start, axis=-1, keepdims=True)
-    return v * (1 / (1 + jnp.sum(turn * turn, axis=-1, keepdims=True)))
+def _turned(change: State, turn: Array, v: State) -> State:
+    """change + v1 − v, with v1 = v + turn × (v + v1): Cayley's form of a rotation."""
+    scale = 2 / (1 + jnp.sum(turn * turn, axis=-1, keepdims=True))
+    return _plus_cross(change, scale * turn, _plus_cross(v, turn, v))
 
 
 def _middle(rate: Callable, h: Scalar, start: State, newton: RootSolver) -> tuple[State, RootInfo]:
@@ -239,14 +279,16 @@ class Boris(_ChargedMethod):
             # Fields at the middle of the step make it symmetric in time.
             t, h = (interval.t0 + interval.t1) / 2, interval.h
             place, _ = equations.absolute(q, v)
-            start, info = v + h / 2 * motion.at_rest(t, place), no_solve(v)
-            rate = partial(motion.acceleration, t, place)
+            half, info = h / 2 * motion.at_rest(t, place), no_solve(v)
             if has_friction:
-                middle, info = _middle(rate, h, start, equations.newton)
+                rate = partial(motion.acceleration, t, place)
+                middle, info = _middle(rate, h, v + half, equations.newton)
+                change = h * rate(middle)
             else:
-                middle = _middle_of_rotation(h / 2 * motion.turning(t, place), start)
-            # Not 2·middle − v: the change alone has the digits that a compensated sum keeps.
-            v = v + h * rate(middle)
+                turn = h / 2 * motion.turning(t, place)
+                change = _turned(2 * half, turn, v + half)
+            # The change alone has the digits that a compensated sum keeps.
+            v = v + change
             return q, v, judge(info, q, v)
 
         return [PartFlow(_drift, True), PartFlow(turn, True)]
@@ -329,7 +371,7 @@ class MagneticSplitting(_ChargedMethod):
                 motion.turning(interval.t0, place + fraction * path) for fraction in fractions
             ]
             turning = jnp.tensordot(weights, jnp.stack(fields), 1)
-            v = v + _cross(turning, path)
+            v = _plus_cross(v, turning, path)
             return q + path, v, judge(no_solve(q), q, v)
 
         def kick(interval, q, v):

@@ -62,7 +62,7 @@ class ChargedParticle(NamedTuple):
 
     def kinetic_momentum(self, q, p, args):
         """m v = p − e A(q): shape (3,)."""
-        return p - args["charge"] * self.A(q, args)
+        return p - self.A(q, args)
 
     def hamiltonian(self, t0, t1, q0, p1, args):
         """H_D = |p1 − e A(q0)|²/(2m), with canonical momenta p = mv + eA: not separable."""

@@ -23,7 +23,8 @@ def vector_potential(q, args):
     A = B0/2 (1 + z²/ℓ²) (−y, x, 0)
     """
     x, y, z = q
-    return args["B0"] / 2 * (1 + (z / args["length"]) ** 2) * jnp.stack([-y, x, jnp.zeros_like(z)])
+    turn = args["charge"] * args["B0"] / 2 * (1 + (z / args["length"]) ** 2)
+    return jnp.stack([-turn * y, turn * x, jnp.zeros_like(z)])
 
 
 def magnetic_field(q, args):

@@ -84,22 +84,27 @@ class Operations(Writer):
         return (a, b) if product is x else (self.neg(a), b)
 
     def _joined_factors(self, c: Num, x: Num) -> tuple[Num, Num] | None:
-        """(c·d, y) for c and x = d·y with c and d known, where c·(d·y) = (c·d)·y to the bit and no
-        number leaves the range earlier: one of them is a power of two. x + x counts as 2·x."""
-        if c.value is None or not c.is_float or c.structural:
+        """(c·d, y) for c and x = d·y with c and d known before all loops, where c·(d·y) = (c·d)·y
+        to the bit and no number leaves the range earlier: one of them is a power of two. x + x
+        counts as 2·x."""
+        if not c.is_float or c.structural or c.loops > 0:
             return None
         if x.op == "add" and x.args[0].key == x.args[1].key:
             d, y = self.const(2, x.dtype), x.args[0]
-        elif x.op == "mul" and (x.args[0].value is not None or x.args[1].value is not None):
-            d, y = x.args if x.args[0].value is not None else x.args[::-1]
+        elif x.op == "mul" and any(factor.loops == 0 for factor in x.args):
+            d, y = x.args if x.args[0].loops == 0 else x.args[::-1]
         else:
             return None
-        two = is_power_of_two(c.value) or is_power_of_two(d.value)
+        powers = [z.value for z in (c, d) if z.value is not None and is_power_of_two(z.value)]
+        if c.value is None or d.value is None:
+            # Computed before the loop, which must be worth it; near 1, it does not leave the range.
+            is_early = powers and y.loops > 0 and 1 / 16 <= abs(powers[0]) <= 16
+            return (self.mul(c, d), y) if is_early else None
         with np.errstate(all="ignore"):
             product = np.asarray(c.value * d.value, x.dtype)
         # A subnormal d·y would have lost digits, which (c·d)·y has.
         normal = np.finfo(x.dtype).tiny <= abs(product) < np.inf
-        return (self.const(product, x.dtype), y) if two and normal else None
+        return (self.const(product, x.dtype), y) if powers and normal else None
 
     def fma(self, a: Num, b: Num, c: Num) -> Num:
         # fma(−a, b, c) has one instruction, whatever operand the sign belongs to.
@@ -129,7 +134,28 @@ class Operations(Writer):
         by_reciprocal = b.op == "sqrt" and a.value is not None and is_power_of_two(a.value)
         if a.is_const(-1) or (by_reciprocal and not a.is_const(1)):
             return self.mul(a, self.div(self.const(1, a.dtype), b))
+        if b.loops == 0 < a.loops:
+            return self.find_or_make(("quotient", a.key, b.key), lambda: self._by_reciprocal(a, b))
         return self.instruction("fdiv", (a, b), "div")
+
+    def _by_reciprocal(self, a: Num, b: Num) -> Num:
+        """a/b in a loop, by 1/b, which LLVM computes before the loop: a division of vectors takes
+        as long as 16 products.
+
+        With r = 1/b and q = a·r, both rounded, and the exact error e = a − q·b, q + e·r rounds to
+        the bits of a/b. But where e has lost digits, for numbers below 1e-290, or a/b is the
+        largest number, it may be its neighbour; and |b| below 5.6e-309 counts as 0.
+
+        **Source** Markstein 1990, *IBM J. Res. Dev.* 34, 111; Brisebarre, Muller & Raina 2004,
+        *IEEE Trans. Comput.* 53, 1069.
+        """
+        r = self.instruction("fdiv", (self.const(1, a.dtype), b), "div")
+        q = self.instruction("fmul", (a, r), "mul")
+        error = self.intrinsic("fma", (self.neg(q), b, a))
+        sum_ = self.intrinsic("fma", (error, r, q))
+        # A zero has the sign of q. Where b is 0 or infinite, or q is, q is right and the sum NaN.
+        is_number = self.op("one", (sum_, self.const(0, a.dtype)), "bool", _write_differ)
+        return self.select(is_number, sum_, q)
 
     def neg(self, a: Num) -> Num:
         if a.value is not None:
@@ -210,7 +236,7 @@ class Operations(Writer):
             return self.const(_COMPARISONS[op](a.value, b.value), "bool")
         if a.op == "select" and b.value is not None and not a.is_float:
             condition, yes, no = a.args  # a status that was chosen: compare what it was chosen from
-            if yes.value is not None or no.value is not None:
+            if any(x.value is not None or x.op == "select" for x in (yes, no)):
                 return self.select(condition, self.compare(op, yes, b), self.compare(op, no, b))
         if a.is_float:
             word = "fcmp " + {"eq": "oeq", "ne": "une"}.get(op, "o" + op)
@@ -252,6 +278,7 @@ class Operations(Writer):
         if condition.op == "not":
             return self.select(condition.args[0], no, yes)
         if yes.dtype == "bool":
+            yes, no = self._where(condition, yes, True), self._where(condition, no, False)
             if yes.value is not None:
                 other = condition if yes.value else self.invert(condition)
                 return self.logic("or" if yes.value else "and", other, no)
@@ -275,6 +302,13 @@ class Operations(Writer):
             return self.number(names, yes.dtype, True, "select", (condition, yes, no))
 
         return self.find_or_make(("select1", condition.key, yes.key, no.key), make)
+
+    def _where(self, condition: Num, x: Num, is_true: bool) -> Num:
+        """A truth value where a condition is known: the condition itself, or its opposite."""
+        if x.serial == condition.serial:
+            return self.const(is_true, "bool")
+        is_opposite = x.op == "not" and x.args[0].serial == condition.serial
+        return self.const(not is_true, "bool") if is_opposite else x
 
     def maximum(self, a: Num, b: Num, op: str = "gt") -> Num:
         """The larger (smaller) of two; NaN where one is NaN."""
@@ -421,6 +455,11 @@ def _shift(word: str, bits: Any, count: Any) -> Any:
         return np.left_shift(bits, count)
     integer = np.asarray(bits).view(f"u{bits.dtype.itemsize}") if word == "lshr" else bits
     return np.right_shift(integer, integer.dtype.type(count)).view(bits.dtype)
+
+
+def _write_differ(kind: str, x: str, y: str) -> str:
+    """Whether two numbers differ; not where one is NaN."""
+    return f"fcmp one {kind} {x}, {y}"
 
 
 def is_power_of_two(x: Any) -> bool:

@@ -55,6 +55,7 @@ class Builder(Operations):
         first_block = len(self.blocks)
         self.begin(head)
         phis, phi_section = [], self.reserve()
+        self.loops += 1
         for number, wide in zip(carry, vec, strict=True):
             names = [self.name() for _ in range(self.U if wide else 1)]
             phis.append(self.number(names, number.dtype, wide))
@@ -70,6 +71,7 @@ class Builder(Operations):
         next_names = [self.refs(a, wide) for a, wide in zip(next_carry, vec, strict=True)]
         next_counter = self.new(f"add nuw nsw i64 {counter}, 1") if count else ""
         self.scopes.pop()
+        self.loops -= 1
         left_from = self.block
         self.emit(f"br label %{head}")
 

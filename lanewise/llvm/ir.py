@@ -62,6 +62,7 @@ class Num:
 
     - `names`: of its vectors in the IR, or of its scalar; none for a constant, which has a `value`.
     - `op`, `args`, `write`: how it was made, where that matters for later numbers.
+    - `loops`: of so many loops, one within the other, the rounds change it.
     - `structural`: a 0 or 1 that the structure of the problem makes, whatever the values are. Only
       for such a zero 0·x is 0 for every x.
     """
@@ -73,6 +74,7 @@ class Num:
     op: str = ""
     args: tuple["Num", ...] = ()
     serial: int = 0
+    loops: int = 0
     structural: bool = False
     write: Callable[..., str] | None = None
 
@@ -124,6 +126,7 @@ class Writer:
         self.section: Section = []  # where instructions are written
         self.blocks: list[tuple[str, Section]] = [(self.block, self.section)]
         self.operations, self.limit = 0, MOST_OPERATIONS
+        self.loops = 0  # around the current place
         # A number that was made in a loop or a branch is not known outside of it: each has a scope.
         self.scopes: list[dict] = [{}]
         self.declarations: set[str] = set()
@@ -200,11 +203,11 @@ class Writer:
     def mark(self) -> tuple:
         """The state of the text, for `back_to`."""
         scope = dict(self.scopes[-1])
-        return len(self.blocks), len(self.section), self.operations, len(self.scopes), scope
+        return len(self.blocks), len(self.section), self.operations, self.loops, len(self.scopes), scope
 
     def back_to(self, mark: tuple) -> None:
         """Forget what was written since the mark, which was made in the same function."""
-        count, length, self.operations, depth, scope = mark
+        count, length, self.operations, self.loops, depth, scope = mark
         del self.blocks[count:], self.scopes[depth:]
         self.block, self.section = self.blocks[-1]
         del self.section[length:]
@@ -234,7 +237,8 @@ class Writer:
         return Num((), dtype, False, np.asarray(value, dtype)[()], structural=structural)
 
     def number(self, names: Sequence[str], dtype: str, vec: bool, op: str = "", args=()) -> Num:
-        return Num(tuple(names), dtype, vec, None, op, args, next(self._serials))
+        loops = max((a.loops for a in args), default=self.loops)
+        return Num(tuple(names), dtype, vec, None, op, args, next(self._serials), loops)
 
     def opaque(self, x: Num) -> Num:
         """The number itself, without what is known of how it was made."""

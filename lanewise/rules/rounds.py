@@ -5,7 +5,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 
-from ..assumed import Assumptions, NotAssumable, may_assume
+from ..assumed import LONGEST, Assumptions, NotAssumable, may_assume
 from ..evaluator import Evaluator
 from ..jaxprs.jaxapi import Jaxpr
 from ..llvm.ir import Num
@@ -146,8 +146,11 @@ class Rounds:
             assumptions = Assumptions(b)
 
             def body(k: Num, failure: Num, *old: Num) -> list[Num]:
+                count = b.operations
                 with e.assuming(assumptions):
                     new = self.round_of(old, k, start)
+                if b.operations - count > LONGEST:
+                    raise NotAssumable
                 assumptions.defer(old, new)
                 changes.extend(x is not y for x, y in zip(old, new, strict=True))
                 return [b.add(k, b.const(1, "int64")), assumptions.wrong(failure), *new]
