@@ -247,3 +247,35 @@ def test_single_precision_stays_single(method):
         p,
     )
     assert sol.qs.dtype == sol.ps.dtype == jnp.float32
+
+
+def test_the_same_hamiltonian_in_other_forms_gives_the_same_steps():
+    """Its potential is read from the program of H where p − A stands in squares only."""
+
+    def A(q):
+        return jnp.stack([-q[1] * (1 + q[2] ** 2), jnp.sin(q[0]), q[0] * q[1]])
+
+    def phi(q):
+        return jnp.cos(q[0]) + q[2] ** 2
+
+    def extra(q):  # A = B + extra
+        return jnp.stack([q[1], q[2] ** 2, -q[0]])
+
+    def in_squares(t0, t1, q, p, args):
+        return jnp.sum((p - A(q)) ** 2) / 3 + phi(q)
+
+    def with_the_other_sign(t0, t1, q, p, args):
+        return (p + -A(q)) @ (p + -A(q)) / 3 + phi(q)
+
+    def expanded(t0, t1, q, p, args):
+        return (p @ p - 2 * p @ A(q) + A(q) @ A(q)) / 3 + phi(q)
+
+    def with_a_linear_term(t0, t1, q, p, args):
+        u = p - (A(q) - extra(q))
+        return (u @ u - 2 * u @ extra(q) + extra(q) @ extra(q)) / 3 + phi(q)
+
+    forms = [with_the_other_sign, expanded, with_a_linear_term]
+    expected = end(dvi.System(in_squares), Q, P, dvi.Boris(), 0.1, 3)
+    for form in forms:
+        found = end(dvi.System(form), Q, P, dvi.Boris(), 0.1, 3)
+        np.testing.assert_allclose(found, expected, atol=1e-14)

@@ -1234,3 +1234,38 @@ def test_long_chains_of_operations_need_no_deep_stack():
     finally:
         sys.setrecursionlimit(before)
     assert "store volatile" in part.ir  # rounds on assumptions, which need to know what is finite
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_quotients_by_a_parameter_of_a_loop_are_rounded_to_the_nearest(left, dtype):
+    """They are made by products with the reciprocal; NumPy divides."""
+    info, unsigned = np.finfo(dtype), {"float64": np.uint64, "float32": np.uint32}[dtype]
+    most = -info.minexp // 3
+    rng, shape = np.random.default_rng(3), (40, 3000)
+
+    def numbers(*shape):
+        sign, exponent = rng.choice([-1, 1], shape), rng.integers(-most, most + 1, shape)
+        return np.ldexp(sign * rng.uniform(1, 2, shape), exponent).astype(dtype)
+
+    x, b = numbers(*shape), numbers(shape[0])
+    ends = [0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -3.0]
+    x[:, : len(ends)] = ends
+    b[: len(ends)] = ends
+    # Quotients that leave the range.
+    x[:, 8:12] = [info.max, -info.max, info.tiny * 1e6, -info.tiny * 1e6]
+
+    def divided(x, b):
+        return lax.scan(lambda _, x: (0.0, (x / b, x * (1 / b))), 0.0, x)[1]
+
+    found, naive = map(np.asarray, jax.jit(lanewise.batched(divided))(x, b))
+    with np.errstate(all="ignore"):
+        expected = x / b[:, None]
+    # Subnormal numbers are zero, and a bound of the range is not exact.
+    normal = (expected == 0) | (np.abs(expected) > info.tiny) | np.isnan(expected)
+    differs = (found.view(unsigned) != expected.view(unsigned)) & ~(
+        np.isnan(found) & np.isnan(expected)
+    )
+    assert not np.any(differs & normal)
+    assert np.mean(naive != expected) > 0.2  # a product with the reciprocal is often the neighbour
+    assert np.all(normal | (found == 0) | (np.abs(found) <= info.tiny))
+    assert not left

@@ -203,7 +203,14 @@ class Writer:
     def mark(self) -> tuple:
         """The state of the text, for `back_to`."""
         scope = dict(self.scopes[-1])
-        return len(self.blocks), len(self.section), self.operations, self.loops, len(self.scopes), scope
+        return (
+            len(self.blocks),
+            len(self.section),
+            self.operations,
+            self.loops,
+            len(self.scopes),
+            scope,
+        )
 
     def back_to(self, mark: tuple) -> None:
         """Forget what was written since the mark, which was made in the same function."""
