@@ -52,17 +52,24 @@ def parts(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> tuple[Any,
 
 
 class ChargedParticle(NamedTuple):
-    """A particle of ``args["charge"]`` and ``args["mass"]`` in a magnetic field.
+    """A particle of ``args["charge"]`` and ``args["mass"]`` in a magnetic field B = ∇ × A with
+    rotational symmetry about the axis z.
 
-    - `A`, `B`: functions (q, args) → vector potential and magnetic field, shape (3,).
+    - `potential_factor`: (q, args) → a of the vector potential A = a (−y, x, 0).
+    - `B`: (q, args) → the field, shape (3,).
     """
 
-    A: Callable[[Any, Any], Any]
+    potential_factor: Callable[[Any, Any], Any]
     B: Callable[[Any, Any], Any]
+
+    def vector_potential(self, q, args):
+        """A = a (−y, x, 0): shape (3,)."""
+        return _around_the_axis(self.potential_factor(q, args), q)
 
     def kinetic_momentum(self, q, p, args):
         """m v = p − e A(q): shape (3,)."""
-        return p - self.A(q, args)
+        # Not e·A: the product of e with the zero of A would be computed.
+        return p - _around_the_axis(args["charge"] * self.potential_factor(q, args), q)
 
     def hamiltonian(self, t0, t1, q0, p1, args):
         """H_D = |p1 − e A(q0)|²/(2m), with canonical momenta p = mv + eA: not separable."""
@@ -89,6 +96,11 @@ class ChargedParticle(NamedTuple):
 
     def _momentum_and_field(self, q, p, args):
         return self.kinetic_momentum(q, p, args), lambda q: self.B(q, args)
+
+
+def _around_the_axis(size: Any, q: Any) -> Any:
+    x, y, z = q
+    return jnp.stack([-size * y, size * x, jnp.zeros_like(z)])
 
 
 def first_correction(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> Any:

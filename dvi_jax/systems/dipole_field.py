@@ -8,11 +8,9 @@ from . import _guiding_centre as guiding_centre
 from ._problem import Parameter, Problem, Start, bound, library_problem, nonzero, positive
 
 
-def vector_potential(q, args):
-    """A = −B0 R³ (−y, x, 0)/r³, of a dipole along −z, as the Earth's."""
-    x, y, z = q
-    cube = jnp.sum(q**2) ** 1.5
-    return -args["B0"] * args["radius"] ** 3 / cube * jnp.stack([-y, x, jnp.zeros_like(z)])
+def potential_factor(q, args):
+    """a = −B0 R³/r³ of A = a (−y, x, 0), of a dipole along −z, as the Earth's."""
+    return -args["B0"] * args["radius"] ** 3 / jnp.sum(q**2) ** 1.5
 
 
 def magnetic_field(q, args):
@@ -22,7 +20,7 @@ def magnetic_field(q, args):
     return args["B0"] * args["radius"] ** 3 / r2**2.5 * (axis - 3 * q[2] * q)
 
 
-_particle = guiding_centre.ChargedParticle(vector_potential, magnetic_field)
+_particle = guiding_centre.ChargedParticle(potential_factor, magnetic_field)
 kinetic_momentum, hamiltonian = _particle.kinetic_momentum, _particle.hamiltonian
 magnetic_moment, corrected_moment = _particle.magnetic_moment, _particle.corrected_moment
 
@@ -74,7 +72,7 @@ def dipole_field(radius: float = 50.0) -> Problem:
     Charged Particles*; field, initial conditions and step are ours.
     """
     radius = positive("radius", radius)
-    v0, A = np.array([0.6, -0.8, 1.0]), np.array([0.0, -radius, 0.0])  # `vector_potential` at q0
+    v0, A = np.array([0.6, -0.8, 1.0]), np.array([0.0, -radius, 0.0])  # A at q0
     dipole = {"the dipole": (0, 0, 0)}
     return library_problem(
         hamiltonian,

@@ -17,14 +17,12 @@ from ._problem import (
 )
 
 
-def vector_potential(q, args):
-    r"""A with B = ∇ × A, of an axisymmetric field that grows along its axis.
+def potential_factor(q, args):
+    r"""a of A = a (−y, x, 0) with B = ∇ × A, of an axisymmetric field that grows along its axis.
 
-    A = B0/2 (1 + z²/ℓ²) (−y, x, 0)
+    a = B0/2 (1 + z²/ℓ²)
     """
-    x, y, z = q
-    turn = args["charge"] * args["B0"] / 2 * (1 + (z / args["length"]) ** 2)
-    return jnp.stack([-turn * y, turn * x, jnp.zeros_like(z)])
+    return args["B0"] / 2 * (1 + (q[2] / args["length"]) ** 2)
 
 
 def magnetic_field(q, args):
@@ -39,8 +37,9 @@ def magnetic_field(q, args):
     return args["B0"] * jnp.stack([-x * z / square, -y * z / square, 1 + z**2 / square])
 
 
-_particle = guiding_centre.ChargedParticle(vector_potential, magnetic_field)
-kinetic_momentum, hamiltonian = _particle.kinetic_momentum, _particle.hamiltonian
+_particle = guiding_centre.ChargedParticle(potential_factor, magnetic_field)
+vector_potential, kinetic_momentum = _particle.vector_potential, _particle.kinetic_momentum
+hamiltonian = _particle.hamiltonian
 magnetic_moment, corrected_moment = _particle.magnetic_moment, _particle.corrected_moment
 energy = at_end(hamiltonian)
 
