@@ -250,7 +250,7 @@ def test_single_precision_stays_single(method):
 
 
 def test_the_same_hamiltonian_in_other_forms_gives_the_same_steps():
-    """Its potential is read from the program of H where p − A stands in squares only."""
+    """Its potential is read from the program of H where p − A is used in squares only."""
 
     def A(q):
         return jnp.stack([-q[1] * (1 + q[2] ** 2), jnp.sin(q[0]), q[0] * q[1]])

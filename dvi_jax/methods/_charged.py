@@ -119,27 +119,29 @@ def _potential(hamiltonian: Callable, q: State, p: State) -> Callable[[State], S
     closed = jax.make_jaxpr(hamiltonian)(q, p)
     jaxpr = closed.jaxpr
 
-    def uses(x):
-        return [eqn for eqn in jaxpr.eqns if any(x is atom for atom in eqn.invars)]
+    def uses(variable):
+        return [eqn for eqn in jaxpr.eqns if any(variable is atom for atom in eqn.invars)]
 
     positions, momenta = jaxpr.invars
-    differences = uses(momenta)
-    if len(differences) != 1 or differences[0].primitive.name not in ("sub", "add"):
+    sums = uses(momenta)
+    if len(sums) != 1 or sums[0].primitive.name not in ("sub", "add"):
         return None
-    (u,) = differences[0].outvars  # p ± A, which is used in squares only
-    squares = uses(u)
-    powers = ("integer_pow", "square", "mul", "dot_general")
-    if any(e.primitive.name not in powers or any(x is not u for x in e.invars) for e in squares):
-        return None
-    if u.aval.shape != p.shape or any(e.params.get("y", 2) < 2 for e in squares):
+    (kinetic,) = sums[0].outvars  # p ± A, of which H must contain squares only
+
+    def is_square(eqn):
+        name, power = eqn.primitive.name, eqn.params.get("y", 2)
+        is_product = name in ("integer_pow", "square", "mul", "dot_general") and power >= 2
+        return is_product and all(atom is kinetic for atom in eqn.invars)
+
+    if kinetic.aval.shape != p.shape or not all(map(is_square, uses(kinetic))):
         return None
     rest = jaxpr.replace(
-        invars=[positions, u],
-        eqns=[eqn for eqn in jaxpr.eqns if eqn is not differences[0]],
+        invars=[positions, kinetic],
+        eqns=[eqn for eqn in jaxpr.eqns if eqn is not sums[0]],
         debug_info=jaxpr.debug_info.with_unknown_names(),
     )
     function = jaxpr_as_fun(ClosedJaxpr(rest, closed.consts))
-    return lambda q: function(q, jnp.zeros(p.shape, u.aval.dtype))[0]
+    return lambda q: function(q, jnp.zeros(p.shape, kinetic.aval.dtype))[0]
 
 
 def _plus_cross(start: State, turning: Array, v: State) -> State:
@@ -147,11 +149,9 @@ def _plus_cross(start: State, turning: Array, v: State) -> State:
     if v.shape[-1] == 2:
         return start + turning * jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
 
-    def turned(x):  # (x, y, z) → (y, z, x)
-        return jnp.roll(x, -1, axis=-1)
-
+    first, second = (partial(jnp.roll, shift=-i, axis=-1) for i in (1, 2))  # (y, z, x), (z, x, y)
     # One sum after the other: each product becomes a fused multiply-add.
-    return start + turned(turning) * turned(turned(v)) - turned(turned(turning)) * turned(v)
+    return start + first(turning) * second(v) - second(turning) * first(v)
 
 
 class _ChargedMethod(SplittingMethod):
@@ -201,7 +201,7 @@ def _drift(interval: Interval, q: State, v: State):
     return q, v, judge(no_solve(q), q, v)
 
 
-def _turned(change: State, turn: Array, v: State) -> State:
+def _rotation(change: State, turn: Array, v: State) -> State:
     """change + v1 − v, with v1 = v + turn × (v + v1): Cayley's form of a rotation."""
     scale = 2 / (1 + jnp.sum(turn * turn, axis=-1, keepdims=True))
     return _plus_cross(change, scale * turn, _plus_cross(v, turn, v))
@@ -286,7 +286,7 @@ class Boris(_ChargedMethod):
                 change = h * rate(middle)
             else:
                 turn = h / 2 * motion.turning(t, place)
-                change = _turned(2 * half, turn, v + half)
+                change = _rotation(2 * half, turn, v + half)
             # The change alone has the digits that a compensated sum keeps.
             v = v + change
             return q, v, judge(info, q, v)

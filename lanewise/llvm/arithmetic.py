@@ -1,24 +1,21 @@
 """Operations on numbers: which are written, which are known already, and which are contracted."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from .ir import FLOATS, TYPES, NotCompilable, Num, Writer, call_of, check_type
+from .finite import Finiteness
+from .ir import FLOATS, TYPES, NotCompilable, Num, check_type
 
-# Operations whose result is not finite where an operand is not.
-_HANDED_ON = frozenset(["add", "sub", "mul", "fma", "neg", "sqrt", "same"])
-_MOST_SEEN = 300  # operations that are followed back: more would take longer than what they save
-_MOST_COMPARED = 12  # with more numbers than this each of them is checked
 _COMPARISONS: dict[str, Callable] = {"eq": np.equal, "ne": np.not_equal, "lt": np.less}
 _COMPARISONS |= {"le": np.less_equal, "gt": np.greater, "ge": np.greater_equal}
 _LOGIC = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor}
 _SHIFTS = {"shift_left": "shl", "shift_right_logical": "lshr", "shift_right_arithmetic": "ashr"}
 
 
-class Operations(Writer):
+class Operations(Finiteness):
     """The operations of the components of a function."""
 
     def add(self, a: Num, b: Num) -> Num:
@@ -95,11 +92,12 @@ class Operations(Writer):
             d, y = x.args if x.args[0].loops == 0 else x.args[::-1]
         else:
             return None
-        powers = [z.value for z in (c, d) if z.value is not None and is_power_of_two(z.value)]
-        if c.value is None or d.value is None:
+        values = [factor.value for factor in (c, d) if factor.value is not None]
+        powers = [value for value in values if is_power_of_two(value)]
+        if len(values) < 2:
             # Computed before the loop, which must be worth it; near 1, it does not leave the range.
-            is_early = powers and y.loops > 0 and 1 / 16 <= abs(powers[0]) <= 16
-            return (self.mul(c, d), y) if is_early else None
+            is_worth_it = powers and y.loops > 0 and 1 / 16 <= abs(powers[0]) <= 16
+            return (self.mul(c, d), y) if is_worth_it else None
         with np.errstate(all="ignore"):
             product = np.asarray(c.value * d.value, x.dtype)
         # A subnormal d·y would have lost digits, which (c·d)·y has.
@@ -149,13 +147,13 @@ class Operations(Writer):
         **Source** Markstein 1990, *IBM J. Res. Dev.* 34, 111; Brisebarre, Muller & Raina 2004,
         *IEEE Trans. Comput.* 53, 1069.
         """
-        r = self.instruction("fdiv", (self.const(1, a.dtype), b), "div")
-        q = self.instruction("fmul", (a, r), "mul")
-        error = self.intrinsic("fma", (self.neg(q), b, a))
-        sum_ = self.intrinsic("fma", (error, r, q))
-        # A zero has the sign of q. Where b is 0 or infinite, or q is, q is right and the sum NaN.
-        is_number = self.op("one", (sum_, self.const(0, a.dtype)), "bool", _write_differ)
-        return self.select(is_number, sum_, q)
+        reciprocal = self.instruction("fdiv", (self.const(1, a.dtype), b), "div")
+        product = self.instruction("fmul", (a, reciprocal), "mul")
+        error = self.intrinsic("fma", (self.neg(product), b, a))
+        result = self.intrinsic("fma", (error, reciprocal, product))
+        # A zero has the sign of q. Where b or q is infinite, or b = 0, q is right and the result NaN.
+        is_number = self.op("one", (result, self.const(0, a.dtype)), "bool", _write_differ)
+        return self.select(is_number, result, product)
 
     def neg(self, a: Num) -> Num:
         if a.value is not None:
@@ -323,73 +321,6 @@ class Operations(Writer):
         if a.value is not None and a.value == a.value:
             return larger
         return self.select(self.is_nan(a), a, larger)
-
-    # --- whether numbers are finite --------------------------------------------------------------
-
-    def is_nan(self, a: Num) -> Num:
-        return self.op("isnan", (a,), "bool", lambda kind, x: f"fcmp uno {kind} {x}, {x}")
-
-    def is_finite(self, a: Num) -> Num:
-        if not a.is_float:
-            return self.const(True, "bool")
-        if a.value is not None:
-            return self.const(np.isfinite(a.value), "bool")
-        return self.all_finite([a])
-
-    def all_finite(self, terms: Sequence[Num], start: int = 1) -> Num:
-        """Whether all numbers, of one type, are finite: whether Σ 0·x is not NaN.
-
-        A number is left out if another one cannot be finite without it. The first `start` numbers
-        are not compared with each other.
-        """
-        terms = list({x.serial: x for x in terms}.values())
-        tests = terms if len(terms) > _MOST_COMPARED else terms[:start]
-        for x in terms[len(tests) :]:
-            if not self.finite_where(frozenset([x.serial]), tests):
-                implications = self.finite_where(frozenset(y.serial for y in tests), [x])
-                tests = [*(y for y in tests if y.serial not in implications), x]
-        zero = self.const(0, terms[0].dtype)
-        total = self.instruction("fmul", (zero, tests[0]), "0·x")
-
-        def write_fma(kind: str, *names: str) -> str:
-            suffix = self.suffix(zero.dtype, kind.startswith("<"))
-            return call_of(f"@llvm.fma.{suffix}", kind, names)
-
-        for vec in (False, True) if len(tests) > 1 else ():
-            kind = self.type(zero.dtype, vec)
-            self.declare(f"{kind} @llvm.fma.{self.suffix(zero.dtype, vec)}({kind}, {kind}, {kind})")
-        for x in tests[1:]:
-            total = self.op("Σ 0·x", (zero, x, total), zero.dtype, write_fma)
-        return self.op("finite", (total,), "bool", lambda t, x: f"fcmp ord {t} {x}, {x}")
-
-    def finite_terms(self, flag: Num) -> tuple[Num, ...]:
-        """The numbers that a result of `is_finite` or `all_finite` is about."""
-        terms, (total,) = [], flag.args
-        while total.op == "Σ 0·x":
-            terms.append(total.args[1])
-            total = total.args[2]
-        return (total.args[1], *reversed(terms))
-
-    def finite_where(self, targets: frozenset[int], premises: Sequence[Num]) -> frozenset[int]:
-        """Which of `targets`, serials of numbers, are finite for certain where all
-        `premises` are: those numbers themselves, what they are a sum or a product of, and so on."""
-        answers: dict[int, frozenset[int]] = {}
-        # A stack of our own: chains of operations are longer than the stack of Python allows.
-        stack = [(x, False) for x in premises]
-        while stack:
-            x, is_seen = stack.pop()
-            if x.value is not None or x.serial in answers:
-                continue
-            parts = x.args if x.op in _HANDED_ON else x.args[1:] if x.op == "select" else ()
-            if parts and not is_seen and len(answers) + len(stack) < _MOST_SEEN:
-                stack.append((x, True))
-                stack += [(a, False) for a in parts]
-                continue
-            mine = [answers.get(a.serial, frozenset()) for a in parts] or [frozenset()]
-            # A selection takes one operand, and it is not known which: only what both show counts.
-            of_parts = mine[0].intersection if x.op == "select" else mine[0].union
-            answers[x.serial] = of_parts(*mine[1:]) | (frozenset([x.serial]) & targets)
-        return frozenset().union(*(answers.get(x.serial, frozenset()) for x in premises))
 
     # --- types -----------------------------------------------------------------------------------
 
