@@ -151,7 +151,7 @@ class Operations(Finiteness):
         product = self.instruction("fmul", (a, reciprocal), "mul")
         error = self.intrinsic("fma", (self.neg(product), b, a))
         result = self.intrinsic("fma", (error, reciprocal, product))
-        # A zero has the sign of q. Where b or q is infinite, or b = 0, q is right and the result NaN.
+        # A zero has the sign of q. Where b or q is infinite, or b = 0, q is right, the result NaN.
         is_number = self.op("one", (result, self.const(0, a.dtype)), "bool", _write_differ)
         return self.select(is_number, result, product)
 
