@@ -233,7 +233,8 @@ def test_starts_with_parameters_and_a_stop_from_a_file(folder):
     np.testing.assert_allclose(
         contents("out.zarr")["stop_t"], np.pi / 2 / np.arange(1, 4), rtol=1e-6
     )
-    bounces = text.replace("stop = ", "jump = ").replace("at_zero", "wall").replace("own.py:energy", "own.py:H")
+    bounces = text.replace('stop = "file.py:at_zero"', 'jump = "file.py:wall"')
+    bounces = bounces.replace("own.py:energy", "own.py:H")
     sweep_file(write(folder, bounces, "jump.toml"), store=folder / "jump.zarr", threads=1)
     np.testing.assert_array_equal(contents("jump.zarr")["jumps.count"], [1, 1, 2])
     for name, bad in (("stop", "starts"), ("starts", "at_zero")):

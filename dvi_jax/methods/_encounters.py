@@ -2,9 +2,10 @@ r"""Close encounters of N bodies: which pairs of bodies meet in a step, and the 
 
 In democratic coordinates the pair (i, j) is moved from the part B to the part A of the Hamiltonian,
 
-    H_A = Σ |P_i|²/(2 m_i) − μ m_i/|Q_i|  −  Σ_close G m_i m_j/|Q_i − Q_j| .
+    H_A = Σ |P_i|²/(2 m_i) − μ m_i/|Q_i|  −  Σ_close G m_i m_j/|Q_i − Q_j| ,
 
-The pairs are chosen once for a step, so that it is one of a symmetric splitting.
+and at a pericentre all pairs and |Σ P_i|²/(2 m_0), the recoil of the first body. They are chosen
+once for a step, so that it is one of a symmetric splitting.
 """
 
 import functools
@@ -45,21 +46,40 @@ _OF_ERROR = _WEIGHTS - np.append(0.0, _extrapolation(_SUBSTEPS[1:]))
 
 
 class Encounters(NamedTuple):
-    """The close pairs of the bodies around the first one, a matrix `close`, their `masses` times G,
-    μ of their Kepler orbits, and the square of the softening."""
+    """The bodies around the first one: their `masses` times G, μ of their Kepler orbits, the square
+    of the softening, the matrix `close` of pairs, on its diagonal the bodies at a pericentre."""
 
     masses: Array
     mu: Array
     softening: Scalar
     close: Bool[Array, "n n"]
 
+    @property
+    def has_recoil(self) -> Bool[Array, ""]:
+        return jnp.any(jnp.diagonal(self.close))
+
+    @property
+    def pairs(self) -> Bool[Array, "n n"]:
+        """The pairs in the part A."""
+        return (self.close | self.has_recoil) & ~jnp.eye(len(self.masses), dtype=bool)
+
+    @property
+    def members(self) -> Bool[Array, "n 1"]:
+        """The bodies that are not moved on Kepler orbits."""
+        return (jnp.any(self.close, axis=1) | self.has_recoil)[:, None]
+
+    def drift(self, v: Array) -> Array:
+        """dx/dt in the part A."""
+        recoil = jnp.sum((self.masses / self.mu)[:, None] * v, axis=0, keepdims=True)
+        return v + jnp.where(self.has_recoil, recoil, 0)
+
     def pull(self, x: Array) -> Array:
         """The accelerations by the attraction of close pairs."""
         difference = x[:, None] - x[None]
-        square = jnp.sum(difference * difference, axis=-1) + self.softening
+        square, pairs = jnp.sum(difference * difference, axis=-1) + self.softening, self.pairs
         # Other pairs may be at one place, a body with itself, where the derivative would be NaN.
-        square = jnp.where(self.close, square, 1)
-        weight = jnp.where(self.close, -self.masses[None] / (square * jnp.sqrt(square)), 0)
+        square = jnp.where(pairs, square, 1)
+        weight = jnp.where(pairs, -self.masses[None] / (square * jnp.sqrt(square)), 0)
         return jnp.sum(weight[..., None] * difference, axis=1)
 
     def without_pull(self, x: Array, acceleration: Array) -> Array:
@@ -72,8 +92,9 @@ class Encounters(NamedTuple):
 
         def with_pairs(kepler):
             dX, dV, defect = _differentiable(_motion, [*self, h, X, V])
-            is_member = jnp.any(self.close, axis=1)[:, None]
-            motion = (jnp.where(is_member, *pair) for pair in zip((dX, dV), kepler, strict=False))
+            motion = (
+                jnp.where(self.members, *pair) for pair in zip((dX, dV), kepler, strict=False)
+            )
             return *motion, kepler[2] & (defect == 0)
 
         return self._if_any(with_pairs, kepler)
@@ -97,11 +118,26 @@ def close_pairs(h: Scalar, X: Array, V: Array, radii: Array) -> Bool[Array, "n n
     return is_close & ~jnp.eye(len(X), dtype=bool)
 
 
+def at_pericentre(h: Scalar, X: Array, V: Array, mu: Array, eta: float) -> Bool[Array, " n"]:
+    """The bodies for which h is longer than `eta` times the time of Pham, Rein & Spiegel (2024),
+
+    τ² = 2 |a|²/(|a'|² + |a| |a''|), with the derivatives of the acceleration a on a Kepler orbit.
+    """
+    r2, xv = (jnp.sum(X * y, axis=-1, keepdims=True) for y in (X, V))
+    v2, factor = jnp.sum(V * V, axis=-1, keepdims=True), -mu[:, None] / (r2 * jnp.sqrt(r2))
+    a = factor * X
+    xa, u = factor * r2, xv / r2
+    jerk = factor * (V - 3 * u * X)
+    snap = factor * (a - 6 * u * V - 3 * ((v2 + xa) / r2 - 5 * u * u) * X)
+    a2, jerk2, snap2 = (jnp.sum(x * x, axis=-1) for x in (a, jerk, snap))
+    return h * h * (jerk2 + jnp.sqrt(a2 * snap2)) > 2 * eta * eta * a2
+
+
 def _motion(*operands: Array) -> list[Array]:
     """The changes by Gragg's extrapolation of the leapfrog, and 0, or 1 if it did not succeed."""
     *constants, h, X, V = operands
     pairs = Encounters(*constants)
-    is_member = jnp.any(pairs.close, axis=1)[:, None]
+    is_member = pairs.members
     V = jnp.where(is_member, V, 0)
     rows = tuple(jnp.asarray(x, X.dtype) for x in (_SUBSTEPS, _WEIGHTS, _OF_ERROR))
     tolerance = _TOLERANCE * float(jnp.finfo(X.dtype).eps)
@@ -116,7 +152,7 @@ def _motion(*operands: Array) -> list[Array]:
 
         def advance(state):
             i, dx, dv, _ = state
-            dx = dx + step * (v + dv)
+            dx = dx + step * pairs.drift(v + dv)
             kick = step * acceleration(x + dx)
             return i + 1, dx, dv + kick, kick
 
@@ -137,7 +173,7 @@ def _motion(*operands: Array) -> list[Array]:
 
         zero = jnp.zeros((2, *x.shape), x.dtype)
         (change, error), _ = lax.scan(add, (zero, zero), rows)
-        scale = _size(jnp.stack([v, rate])) * jnp.abs(step) + _size(change)
+        scale = _size(jnp.stack([pairs.drift(v), rate])) * jnp.abs(step) + _size(change)
         # Of each body relative to its own change: a slow or distant one has small numbers.
         error = jnp.max(_size(error) / jnp.where(scale > 0, scale, 1))
         is_finite = jnp.all(jnp.isfinite(change))
