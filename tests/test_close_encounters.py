@@ -238,6 +238,38 @@ def test_a_motion_that_is_not_found_is_a_status(monkeypatch):
     assert np.isnan(sol.q_final).all()
 
 
+def test_deep_encounters_are_resolved_and_collisions_are_a_status():
+    """One step through a smallest distance of about 60 b², and a fall into the first body."""
+
+    def drift(q, v, method):
+        run = {"num_steps": 1, "method": method, "save": END, "throw": False}
+        run |= {"q0": q, "p0": MASSES[:, None] * v, "observe": dvi.MaxDrift(ENERGY)}
+        sol = dvi.integrate(TWO, **run)
+        return sol.result, sol.observed
+
+    @jax.jit
+    @jax.vmap
+    def planets(b):
+        q = jnp.array([[0.0, 0, 0], [1, 0, 0], [1, -0.02, 0]]).at[2, 0].add(b)
+        return drift(q, jnp.array([[0.0, 0, 0], [0, 1, 0], [0, 1.5, 0]]), METHOD)
+
+    result, error = planets(jnp.array([0.1, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5, 0.0]))
+    assert (result == dvi.RESULTS.successful).tolist() == [True] * 6 + [False] * 2
+    assert (result == dvi.RESULTS.not_converged).tolist() == [False] * 6 + [True] * 2
+    assert error[:6].max() < 3e-10
+
+    @jax.jit
+    @jax.vmap
+    def star(speed):
+        q = jnp.array([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0]])
+        v = jnp.array([[0.0, 0, 0], [-4, 0, 0], [0, 0.4, 0]]).at[1, 1].set(speed)
+        return drift(q, v, WITH_PERICENTRES)
+
+    result, error = star(jnp.array([1.0, 1e-1, 1e-2, 1e-3, 0.0]))
+    assert (result == dvi.RESULTS.successful).tolist() == [True] * 4 + [False]
+    assert error[:4].max() < 1e-8
+
+
 def test_what_the_encounters_require_is_named():
     with pytest.raises(ValueError, match="must be 'democratic', got 'jacobi'"):
         dvi.WisdomHolman(encounters=3.0)

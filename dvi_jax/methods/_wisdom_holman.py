@@ -300,7 +300,7 @@ class WisdomHolman(SplittingMethod):
         x[1:] = x[1] + 1e-6 * unit * numbers[:, None]
         x = jnp.asarray(x)
         pairs = self._pairs(equations, interval, x, ~jnp.eye(len(numbers), dtype=bool))
-        pull = np.asarray(pairs.pull(x[1:]))
+        pull = np.asarray(pairs.pull(x[1:, None] - x[None, 1:]))
         difference = np.asarray(equations.momentum_rate(interval, x, p) / scale)[1:] - pull
         size, of_first = np.abs(pull).max(), float(pairs.mu[0]) / unit**2
         # Where the attraction is so small that the first body hides it, it is not compared.
