@@ -440,6 +440,28 @@ def test_lyapunov_exponents_of_billiards_are_those_of_their_geometry(name, focus
     assert np.max(np.abs(sol.jumps.qs_before[:count])) < 2 + 1e-12
 
 
+@slow
+def test_sinais_billiard_with_a_small_disc():
+    """Dahlqvist's exponent of the map from disc to disc, −2 ln R + C + O(R ln²R) for a disc of the
+    radius R in a unit square (arXiv:chao-dyn/9601007), by the mean time between reflections."""
+    radius, random = 0.05, np.random.default_rng(1)
+    table = systems.sinai_billiard(radius, max_jumps=0)
+    q, angle = random.uniform(0.1, 1, (64, 2)), random.uniform(0, 2 * np.pi, 64)
+    p = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def exponent(q, p):
+        options = {"observe": dvi.LyapunovSpectrum(1), "save": dvi.Save(final=True)}
+        return dvi.integrate(table, q, p, h=2.0, num_steps=20_000, **options).observed[0]
+
+    between = (4 - np.pi * radius**2) / (2 * radius)  # π × area / boundary of the disc
+    values = between * np.asarray(jax.jit(jax.vmap(exponent))(q, p))
+    zeta = 1.2020569031595942  # ζ(3)
+    limit = -2 * np.log(radius / 2) + 1 - 4 * np.log(2) + 27 * zeta / (2 * np.pi**2)
+    error = np.std(values) / 8
+    assert error < 0.06
+    assert abs(np.mean(values) - limit) < 3 * error
+
+
 def test_a_problem_with_jumps_is_run_with_them_or_refused():
     ball = systems.bouncing_ball(0.8)
     sol = dvi.integrate(ball, num_steps=60, method="strang")
