@@ -30,6 +30,20 @@ def test_figures_of_dynamics_keep_their_bounds(monkeypatch, capsys):
     assert capsys.readouterr().out.count("| holds |") == 8
 
 
+@pytest.mark.slow
+def test_figures_of_encounters_keep_their_bounds(monkeypatch, capsys):
+    """Energy errors, and escapes from a few systems in less time than the whole row."""
+    pytest.importorskip("rebound")
+    bench = load("encounters", monkeypatch)
+    assert bench.main(["--rows", "energy", "--check"]) == 0
+    assert capsys.readouterr().out.count("  ok ") == 3
+    text, is_good = next(bench.escapes(32, 4000))
+    assert is_good, text
+    # The control: heavier planets leave earlier.
+    times = bench.times_of_rebound(32, 3, 4000)
+    assert bench.ks_2samp(times, times / 3).pvalue < 0.01
+
+
 def test_a_bound_that_is_missed_is_told(monkeypatch, capsys):
     bench = load("dynamics", monkeypatch)
     monkeypatch.setattr(bench, "ROWS", {"one": lambda: iter([("x", "2", "1", False)])})

@@ -24,7 +24,7 @@ nothing = 3
 def failing(t0, t1, q0, p1, args):
     return q0.nothing
 
-broken = dvi.System(failing)
+broken, ball = dvi.System(failing), dvi.systems.bouncing_ball()
 forced = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2 + q0[0] * jnp.cos(t0))
 """
 
@@ -115,6 +115,7 @@ REJECTED = [
     (SEVERAL, "[1e-4, 1e-3]", "drift.epsilons", "three numbers or more"),
     (SEVERAL, "[1e-4, 0, 1e-2]", "drift.epsilons", "above zero"),
     ("own.py:system", "own.py:broken", "cannot be searched: AttributeError", "functions"),
+    ("own.py:system", "own.py:ball", "has jumps", "a system without jumps"),
     ("own.py:system", "own.py:forced", "depends on the time", "samples.times"),
 ]
 

@@ -214,6 +214,7 @@ class Stiffness(dvi.starts.Seeded):
 
 starts = Stiffness(3, (1,), 0, "start")
 at_zero = dvi.Stop(lambda t, q, p, args: -q[0])
+wall = dvi.Jump(at_zero.g, lambda q, p: (q, -p))
 """
 
 
@@ -232,6 +233,10 @@ def test_starts_with_parameters_and_a_stop_from_a_file(folder):
     np.testing.assert_allclose(
         contents("out.zarr")["stop_t"], np.pi / 2 / np.arange(1, 4), rtol=1e-6
     )
+    bounces = text.replace('stop = "file.py:at_zero"', 'jump = "file.py:wall"')
+    bounces = bounces.replace("own.py:energy", "own.py:H")
+    sweep_file(write(folder, bounces, "jump.toml"), store=folder / "jump.zarr", threads=1)
+    np.testing.assert_array_equal(contents("jump.zarr")["jumps.count"], [1, 1, 2])
     for name, bad in (("stop", "starts"), ("starts", "at_zero")):
         wrong = re.sub(f'{name} = "file.py:\\w+"', f'{name} = "file.py:{bad}"', text)
         with pytest.raises(InputError, match=name):

@@ -8,6 +8,7 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax import interop, systems
+from dvi_jax.interop import rebound_side
 
 rebound = pytest.importorskip("rebound")
 
@@ -155,6 +156,16 @@ def test_a_file(tmp_path):
         interop.from_rebound(path, snapshot=7)
 
 
+def test_names_are_those_on_which_two_readings_agree(tmp_path, monkeypatch):
+    """REBOUND may give a body the name of another one: here it does in the first reading."""
+    three_bodies().save_to_file(str(tmp_path / "archive.bin"))
+    name, wrong = rebound_side._name, iter(["giant", "Sun", None])
+    monkeypatch.setattr(rebound_side, "_name", lambda body: next(wrong, name(body)))
+    problem = interop.from_rebound(tmp_path / "archive.bin")
+    assert next(wrong, "all were read") == "all were read"
+    assert problem.names == ("Sun", "giant", None)
+
+
 # --- archives
 
 
@@ -237,6 +248,10 @@ def test_bodies_of_an_archive_that_come_and_go(tmp_path):
         times = [3.0, 3.5, 4.0, 4.5]
         path = archive_of(tmp_path / f"named{k}.bin", three_bodies(), times, change)
         assert list(interop.from_archive(path).body.values) == ["Sun", "giant", "body 2", "comet"]
+        names = [interop.from_rebound(path, snapshot=i).names for i in range(4)]
+        assert names[0] == ("Sun", "giant", None)
+        assert names[1:3] == [("Sun", None), ("Sun", None, "comet")]
+        assert names[3] == interop.from_rebound(path).names == ("Sun", None, "comet", "giant")
     data = interop.from_archive(path, elements="jacobi")
     assert list(data.body.values) == ["Sun", "giant", "body 2", "comet"]
     np.testing.assert_array_equal(data["count"], [3, 2, 3, 4])

@@ -440,18 +440,97 @@ def test_lyapunov_exponents_of_billiards_are_those_of_their_geometry(name, focus
     assert np.max(np.abs(sol.jumps.qs_before[:count])) < 2 + 1e-12
 
 
+@slow
+def test_sinais_billiard_with_a_small_disc():
+    """Dahlqvist's exponent of the map from disc to disc, −2 ln R + C + O(R ln²R) for a disc of the
+    radius R in a unit square (arXiv:chao-dyn/9601007), by the mean time between reflections."""
+    radius, random = 0.05, np.random.default_rng(1)
+    table = systems.sinai_billiard(radius, max_jumps=0)
+    q, angle = random.uniform(0.1, 1, (64, 2)), random.uniform(0, 2 * np.pi, 64)
+    p = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def exponent(q, p):
+        options = {"observe": dvi.LyapunovSpectrum(1), "save": dvi.Save(final=True)}
+        return dvi.integrate(table, q, p, h=2.0, num_steps=20_000, **options).observed[0]
+
+    between = (4 - np.pi * radius**2) / (2 * radius)  # π × area / boundary of the disc
+    values = between * np.asarray(jax.jit(jax.vmap(exponent))(q, p))
+    zeta = 1.2020569031595942  # ζ(3)
+    limit = -2 * np.log(radius / 2) + 1 - 4 * np.log(2) + 27 * zeta / (2 * np.pi**2)
+    error = np.std(values) / 8
+    assert error < 0.06
+    assert abs(np.mean(values) - limit) < 3 * error
+
+
 def test_a_problem_with_jumps_is_run_with_them_or_refused():
     ball = systems.bouncing_ball(0.8)
     sol = dvi.integrate(ball, num_steps=60, method="strang")
     np.testing.assert_allclose(sol.jumps.ts[:3], bounces(0.8, 3)[0], atol=1e-13)
     assert dvi.integrate(ball, num_steps=60, method="strang", jump=[]).jumps is None
     for call in (
-        lambda: dvi.sweep(ball, h=0.1, num_steps=10, observe={"q": dvi.Last(lambda q, p: q)}),
         lambda: dvi.explore(ball),
         lambda: dvi.interop.solve_ivp(ball, (0, 1), [1.0, 0.0], h=0.1),
     ):
-        with pytest.raises(ValueError, match=r"only dvi\.integrate makes"):
+        with pytest.raises(ValueError, match=r"only dvi\.integrate and dvi\.sweep make"):
             call()
+
+
+def test_jumps_in_labelled_results_and_sweeps():
+    """Those of single runs; a sweep has the states of jumps where it saves states."""
+    rs, ball = jnp.array([0.5, 0.8, 0.9]), systems.bouncing_ball()
+    options = {"h": 0.07, "num_steps": 60, "method": "strang"}
+
+    def one(r):
+        return drop(r, stop=dvi.Stop(lambda q, p: q[0] - 2), num_steps=60)
+
+    sols = jax.vmap(one)(rs)
+    data = sols.to_xarray(dims="r", components=["height"], units={"q": "m", "t": "s"})
+    assert data["jumps.qs_after"].dims == ("r", "jumps_dim", "component")
+    assert data["jumps.ts"].dims == ("r", "jumps_dim")
+    assert data["jumps.count"].dims == ("r",)
+    units = [data[f"jumps.{x}"].attrs["units"] for x in ("ts", "qs_before", "qs_after")]
+    assert units == ["s", "m", "m"]
+    single = sols.jumps.ts[1], jax.tree.map(lambda x: x[1], sols).to_xarray()["jumps.ts"]
+    np.testing.assert_array_equal(*single)
+    assert "jumps.ts" not in drop(0.8, jump=None).to_xarray()
+    axis = {"args": {**ball.args, "restitution": dvi.Axis("r", np.asarray(rs))}, **options}
+    observe = {"x": dvi.Last(lambda q, p: q)}
+    full = dvi.sweep(ball, save=dvi.Save(every=20), **axis).to_xarray()
+    for name, values in vars(sols.jumps).items():
+        np.testing.assert_allclose(full[f"jumps.{name}"], values, rtol=1e-13)
+    assert full["jumps.qs_after"].dims == ("r", "jumps_dim", "component")
+    few = dvi.sweep(ball.system, ball.q0, ball.p0, jump=list(ball.jumps), observe=observe, **axis)
+    few = few.to_xarray()
+    assert [x for x in few if x.startswith("jumps")] == ["jumps.count"]
+    np.testing.assert_array_equal(few["jumps.count"], sols.jumps.count)
+    falls = dvi.sweep(ball, jump=[], observe=observe, **axis).to_xarray()
+    assert "jumps.count" not in falls
+    assert (falls.x < -7).all()
+    with pytest.raises(ValueError, match="reserved name"):
+        dvi.sweep(ball, observe={"jumps": observe["x"]}, **axis)
+
+
+def test_sections_and_tangent_maps_with_jumps():
+    """Crossings of the middle of a stadium are on the chords between reflections."""
+    table = systems.stadium()
+    q0, p0 = np.asarray(table.q0), np.asarray(table.p0)
+    steps = {"h": 0.5, "num_steps": 100, "jump": table.jumps, "args": table.args}
+    middle = lambda t, q, p, args: q[0]  # noqa: E731
+    found = dvi.poincare_section(table.system, q0[None], p0[None], middle, crossings=5, **steps)
+    jumps = dvi.integrate(table, h=0.5, num_steps=100).jumps
+    ends, speeds = np.asarray(jumps.qs_before), np.asarray(jumps.ps_before)
+    heights, begin = [], q0
+    for end, v in zip(ends[: int(jumps.count)], speeds, strict=False):
+        if begin[0] < 0 < end[0]:
+            heights.append(end[1] - v[1] / v[0] * end[0])
+        begin = end
+    np.testing.assert_allclose(found.qs[0, :, 1], heights[:5], atol=1e-12)
+    back = dvi.ReturnMap(table.system, middle, 0.5, 50, jump=table.jumps)
+    end = back(found.qs[0, 0], found.ps[0, 0], args=table.args)
+    np.testing.assert_allclose(end.q, found.qs[0, 1], atol=1e-12)
+    run_of = {"h": 0.07, "num_steps": 30, "method": "strang", "args": 0.8, "jump": FLOOR}
+    M = dvi.tangent_map(BALL, [1.0], [0.0], **run_of)
+    assert abs(np.linalg.det(M) - 0.8**2) < 1e-12
 
 
 @slow

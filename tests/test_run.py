@@ -43,6 +43,8 @@ def number_of(t0, t1, q0, p1, args):
     return float(q0[0]) * q0
 
 forced, numbered = dvi.System(H_D, force=branch), dvi.System(H_D, force=number_of)
+ball = dvi.systems.bouncing_ball(0.8)
+walls = list(ball.jumps)
 explosive = dvi.System(lambda t0, t1, q0, p1, args: jnp.sum(p1**2) / 2 - jnp.sum(q0**4))
 """
 KEPLER = 'system = "kepler"\n'
@@ -122,6 +124,19 @@ def test_systems_from_a_file(folder, system):
     with np.load(report.folder / "trajectory.npz") as saved:
         np.testing.assert_allclose(saved["qs"][-1], [q], rtol=1e-14)
     assert report.files == ["trajectory.npz", "report.json"]
+
+
+def test_jumps_of_a_system_and_of_a_file(folder):
+    """A ball with its floor; the same from a list in the file."""
+    text = f'system = "own.py:ball"\nh = 0.1\nsteps = 40\nmethod = "Strang"\n{BARE}'
+    jumps = dvi.integrate(systems.bouncing_ball(0.8), h=0.1, num_steps=40, method="strang").jumps
+    assert jumps.count == 2
+    for i, line in enumerate(("", 'jump = "own.py:walls"\n')):
+        report = run_file(write(folder, line + text), out=f"run{i}")
+        with np.load(report.folder / "trajectory.npz") as saved:
+            for name, values in vars(jumps).items():
+                np.testing.assert_allclose(saved[f"jumps/{name}"], values, rtol=1e-13)
+    refuses(command("run", write(folder, 'jump = "own.py:energy"\n' + text)), "jump:", "dvi.Jump")
 
 
 def test_given_times_and_parameters(folder):

@@ -75,7 +75,8 @@ class _SectionRun(eqx.Module):
 def _section_run(system: System, section: Section, keywords: Mapping[str, Any]) -> _SectionRun:
     integrator, settings = integrator_of(keywords)
     num_steps = whole("num_steps", settings["num_steps"])
-    options = {"integrator": integrator, "num_steps": num_steps, "stop": settings.get("stop")}
+    options = {name: settings.get(name) for name in ("stop", "jump")}
+    options |= {"integrator": integrator, "num_steps": num_steps}
     return _SectionRun(system, section, options)
 
 
@@ -138,7 +139,7 @@ def poincare_section(
     - `q0`, `p0`: initial conditions, with the orbits along the first axis: shape (orbits, …).
     - `g`, `direction`, `skip`: see `Section`; `crossings`: number of crossings for each orbit.
     - `epsilon`: a number, or one for each orbit; so may be a `dvi.Axis` in `args`.
-    - `stop`: where an orbit ends, an escape for instance.
+    - `stop`: where an orbit ends, an escape for instance. `jump`: bounces and the like.
     - `throw`: raise if an orbit has fewer crossings; otherwise read ``.status``.
 
     **Returns** a `PoincareSection`.
@@ -268,7 +269,7 @@ class ReturnMap(eqx.Module):
     `poincare_section`;
 
     - `h`, `num_steps`: size and number of the steps, which are always all computed.
-    - `returns`: which return, 1 for the first.
+    - `returns`: which return, 1 for the first. `jump`: events that change the state.
 
     The status is `never_crossed` or `too_few_crossings` if the orbit does not return within the
     steps, `failed` if the trajectory fails; the state is then NaN.
@@ -283,6 +284,7 @@ class ReturnMap(eqx.Module):
     method: Method | None = None
     root_finder: RootSolver | None = None
     integrator: Integrator | None = None
+    jump: Any = None
 
     def __check_init__(self):
         check_system(self.system)
@@ -290,7 +292,7 @@ class ReturnMap(eqx.Module):
 
     def _section_run(self) -> _SectionRun:
         section = Section(self.g, self.direction, whole("returns", self.returns))
-        names = ("method", "root_finder", "integrator", "num_steps")
+        names = ("method", "root_finder", "integrator", "num_steps", "jump")
         return _section_run(self.system, section, {name: getattr(self, name) for name in names})
 
     def __call__(

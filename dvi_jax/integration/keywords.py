@@ -4,7 +4,7 @@ A function declares ``**settings: Unpack[OrbitSettings]``, which type checkers c
 calls; `checked_keywords` makes the same comparison when the program runs.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Required, TypedDict
 
 from lanewise import Layout
@@ -12,7 +12,7 @@ from lanewise import Layout
 from ..engine.newton import RootSolver
 from ..lattices import Lattice
 from ..methods import Method
-from ..observe import Stop
+from ..observe import Jump, Stop
 from .arithmetic import Arithmetic
 from .integrator import Integrator, chosen
 
@@ -63,8 +63,10 @@ class IntegrationSettings(OrbitSettings, total=False):
 
 
 class TangentSettings(IntegrationSettings, total=False):
-    """The same, and `throw`: raise an error if the trajectory fails (True by default)."""
+    """The same, and `jump`: events that change the state; `throw`: raise an error if the trajectory
+    fails (True by default)."""
 
+    jump: Jump | Sequence[Jump] | None
     throw: bool
 
 
@@ -72,13 +74,14 @@ class SectionSettings(OrbitSettings, total=False):
     """As `OrbitSettings`, and
 
     - `h`: step size [time], and `num_steps`: number of steps; both are necessary.
-    - `stop`: a `Stop`, the condition of an early end.
+    - `stop`: a `Stop`, the condition of an early end. `jump`: events that change the state.
     - `throw`: raise an error if an orbit has too few crossings (True by default).
     """
 
     h: Required[Any]
     num_steps: Required[int]
     stop: Stop | None
+    jump: Jump | Sequence[Jump] | None
     throw: bool
 
 

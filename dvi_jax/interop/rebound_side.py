@@ -111,13 +111,12 @@ def from_rebound(simulation: Any, *, snapshot: int = -1) -> ReboundProblem:
 
     **Source** Rein & Liu 2012, *Astron. Astrophys.* 537, A128.
     """
-    rebound = require("rebound", "interop.from_rebound")
+    rebound, names = require("rebound", "interop.from_rebound"), None
     if isinstance(simulation, str | PathLike):
         simulation = user_file("simulation", simulation)
         subject = f"snapshot {snapshot} of {str(simulation)!r} (0: the first, −1: the last)"
         with _reading(subject):
-            simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
-        simulation.synchronize()  # a snapshot may have been taken between half steps
+            simulation, names = _snapshot(rebound.Simulationarchive(str(simulation)), snapshot)
     elif snapshot != -1 and isinstance(simulation, rebound.Simulation):
         raise ValueError(
             f"snapshot requires the path of a Simulationarchive, got {snapshot} with a Simulation."
@@ -125,9 +124,9 @@ def from_rebound(simulation: Any, *, snapshot: int = -1) -> ReboundProblem:
     description = "a rebound.Simulation, or the path of a Simulationarchive"
     hint = "For snapshot i of an open archive give archive[i]."
     instance("simulation", simulation, rebound.Simulation, description, hint)
+    names = tuple(_names(simulation) if names is None else names)
     _check_convertible(simulation)
     numbers = _finite("the simulation", simulation, ("t", "dt", "G", "softening"))
-    names = tuple(_name(b) for b in simulation.particles)
     texts = [str(name or f"body {i}") for i, name in enumerate(names)]
     columns = ("m", "x", "y", "z", "vx", "vy", "vz", "r")
     bodies = zip(texts, simulation.particles, strict=True)
@@ -242,7 +241,7 @@ def from_archive(archive: Any, *, elements: str | None = None) -> Any:
             archive = rebound.Simulationarchive(str(user_file("archive", archive)))
         description = "the path of a Simulationarchive, or a rebound.Simulationarchive"
         instance("archive", archive, rebound.Simulationarchive, description)
-        snapshots = [_snapshot(archive, i) for i in range(len(archive))]
+        snapshots = [_row(*_snapshot(archive, i)) for i in range(len(archive))]
     columns: dict[Any, int] = {}
     places = [[columns.setdefault(key, len(columns)) for key in keys] for *_, keys in snapshots]
     tables = np.full((len(snapshots), len(columns), 8), np.nan)
@@ -288,15 +287,20 @@ def from_archive(archive: Any, *, elements: str | None = None) -> Any:
     return data
 
 
-def _snapshot(archive: Any, i: int) -> tuple[float, np.ndarray, list[tuple[Any, int]]]:
-    """Time, rows (bodies, 8) of x, v, m, r, and the names, each with its number among equal ones,
-    of a snapshot."""
+def _snapshot(archive: Any, i: int) -> tuple[Any, list[Any]]:
+    """A snapshot, and the names of its bodies."""
     sim = _synchronised(archive, i)
     alive, readings, names = [sim], [], _names(sim)
     while any(names) and names not in readings:
         readings.append(names)
         alive.append(_synchronised(archive, i))  # so that no address is used again
         names = _names(alive[-1]) if len(alive) <= _READINGS else [None] * len(names)
+    return sim, names
+
+
+def _row(sim: Any, names: list[Any]) -> tuple[float, np.ndarray, list[tuple[Any, int]]]:
+    """Time, rows (bodies, 8) of x, v, m, r, and the names, each with its number among equal ones,
+    of a snapshot."""
     shapes = {"xyz": (sim.N, 3), "vxvyvz": (sim.N, 3), "m": sim.N, "r": sim.N}
     fields_of_bodies = {name: np.empty(shape) for name, shape in shapes.items()}
     sim.serialize_particle_data(**fields_of_bodies)
@@ -341,7 +345,7 @@ def _orbits(q: Any, v: Any, masses: Any, G: float, frame: str) -> dict[str, np.n
 def _reading(subject: str) -> Iterator[None]:
     try:
         yield
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, IndexError) as error:
         raise ValueError(f"REBOUND cannot read {subject}: {error}") from None
 
 

@@ -21,7 +21,7 @@ from ..engine.newton import find_root
 from ..problem import kepler as _kepler
 from ..problem.flows import value_of
 from ..problem.frames import Democratic, Jacobi
-from ._encounters import Encounters, close_pairs
+from ._encounters import Encounters, at_pericentre, close_pairs
 from ._schemes import ORDERS_OF_CORRECTORS, as_scheme, check_scheme, corrector, join_neighbours
 from ._splitting import PartFlow, SplittingMethod, Stage
 from ._strang import Strang
@@ -62,6 +62,8 @@ class WisdomHolman(SplittingMethod):
     - `scheme`: as for `Splitting`, for example (10, 6, 4) for long steps at high accuracy.
     - `encounters`: pairs of bodies that come closer than this number of Hill radii, for example
       3.0, are integrated apart, in democratic coordinates; see below. None: no pair is.
+    - `pericentres`: steps longer than this number of τ, for example 1.0, are those at a pericentre,
+      in democratic coordinates; see below. None: none is.
     - `G`: the gravitational constant in the Kepler part, a number or a function of args; None:
       ``args["G"]`` if there is one, else 1. Another value changes the accuracy, not the limit.
 
@@ -81,11 +83,19 @@ class WisdomHolman(SplittingMethod):
     and without a pair differ in whether it is close at the end; then by the error of one step.)
     ``stats["encounter_steps"]`` counts the steps with close pairs. Derivatives are those for the
     given pairs. Many revolutions of a pair in one step fail with the status `not_converged`.
-    Recoil of the first body from a massive one near its pericentre is not resolved.
+
+    **Pericentres** of eccentric orbits are resolved with `pericentres` only. In a step with
+    |h| > `pericentres` τ for one of the bodies, at its start or at its end, where
+
+        τ² = 2 |a|²/(|a'|² + |a| |a''|),    a the acceleration by the first body,
+
+    all bodies are moved to round-off, under Newton's attraction and with the recoil of the first
+    body: then H_B′ has only what else is in V, and the force. On a circle τ = 1/n, at a pericentre
+    with e → 1 it is 0.82/ω. ``stats["pericentre_steps"]`` counts these steps.
 
     A run whose h and initial state are known **warns** if the interaction is evaluated less than
-    ten times in the shortest period, or in a circle with the angular velocity of a pericentre: such
-    steps have resonances with the orbits.
+    ten times in the shortest period, or, without `pericentres`, in a circle with the angular
+    velocity of a pericentre: such steps have resonances with the orbits.
 
     **Raises** `ValueError` for another corrector or other coordinates and, in a run, for positions
     of another shape, a system that is not T(p) + V(q), and a T of another form.
@@ -94,7 +104,7 @@ class WisdomHolman(SplittingMethod):
     J.* 116, 2067 (democratic); Wisdom, Holman & Touma 1996, *Fields Inst. Commun.* 10, 217 and
     Wisdom 2006, *Astron. J.* 131, 2294 (correctors; their coefficients follow here from the linear
     conditions); Rein & Tamayo 2015, *MNRAS* 452, 376; Lu, Hernandez & Rein 2024, *MNRAS* 533, 3708
-    (encounters).
+    (encounters, pericentres).
     """
 
     coordinates: Coordinates = eqx.field(static=True, default="jacobi")
@@ -102,6 +112,7 @@ class WisdomHolman(SplittingMethod):
     scheme: Any = eqx.field(static=True, default_factory=Strang, converter=as_scheme)
     G: Any = None
     encounters: float | None = eqx.field(static=True, default=None)
+    pericentres: float | None = eqx.field(static=True, default=None)
 
     has_coordinates: ClassVar[bool] = True
 
@@ -116,9 +127,14 @@ class WisdomHolman(SplittingMethod):
                 f"scheme={self.scheme!r}."
             )
 
-        if self.encounters is not None:
-            positive("encounters", self.encounters)
-            one_of("coordinates of a method with encounters", self.coordinates, ("democratic",))
+        for name in ("encounters", "pericentres"):
+            if (value := getattr(self, name)) is not None:
+                positive(name, value)
+                one_of(f"coordinates of a method with {name}", self.coordinates, ("democratic",))
+
+    @property
+    def _switches(self) -> bool:
+        return self.encounters is not None or self.pericentres is not None
 
     def is_double_only(self, equations) -> bool:
         return True
@@ -147,7 +163,7 @@ class WisdomHolman(SplittingMethod):
                 f"has the mass {masses.max():g} and body 0 only {masses[0]:g}."
             )
         self._check_steps(equations, interval, q, p)
-        if self.encounters is not None and len(q) > 2:
+        if self._switches and len(q) > 2:
             self._check_attraction(equations, interval, *equations.absolute(q, p), scale)
 
     def _check_steps(self, equations, interval, q, p):
@@ -166,15 +182,17 @@ class WisdomHolman(SplittingMethod):
             # Of a full circle at the angular velocity of the pericentre.
             times = 2 * np.pi * np.array([np.sqrt(a**3 / mu), (a * (1 - e)) ** 2 / momentum])
         times = np.where(np.isfinite(times), times, np.inf)  # none for an orbit that is not bound
+        times = times if self.pericentres is None else times[:1]
         i, stages = int(times.min(axis=0).argmin()), len(self.substeps())
         steps = times[:, i] / abs(float(interval.h))
         if steps.min() * stages < _FEWEST:
             largest = times[:, i].min() * stages / _FEWEST
+            places = [f", or {n:.2g} at the angular velocity of its pericentre" for n in steps[1:]]
             warnings.warn(
                 f"h = {float(interval.h):g} is too long for dvi.WisdomHolman: the orbit of body "
-                f"{i + 1} has the period {times[0, i]:.4g}, which are {steps[0]:.2g} steps, or "
-                f"{steps[1]:.2g} at the angular velocity of its pericentre. At least {_FEWEST} are "
-                f"necessary: |h| ≤ {largest:.2g}, or a scheme with more stages.",
+                f"{i + 1} has the period {times[0, i]:.4g}, which are {steps[0]:.2g} steps"
+                f"{''.join(places)}. At least {_FEWEST} are necessary: |h| ≤ {largest:.2g}, or a "
+                "scheme with more stages.",
                 stacklevel=user_level(),
             )
 
@@ -255,9 +273,10 @@ class WisdomHolman(SplittingMethod):
 
         def interaction(interval, X, V):
             # The recoil of the first body is in this part: half before the kick, half after it.
-            X = X + interval.h / 2 * frame.drift(base[1] + V)
+            moves = 1 if pairs is None else jnp.where(pairs.has_recoil, 0, 1)
+            X = X + moves * interval.h / 2 * frame.drift(base[1] + V)
             V, info = kick(interval, X, V)
-            X = X + interval.h / 2 * frame.drift(base[1] + V)
+            X = X + moves * interval.h / 2 * frame.drift(base[1] + V)
             return X, V, judge(info, X, V)
 
         return [PartFlow(kepler, True), PartFlow(interaction, not implicit)]
@@ -281,7 +300,7 @@ class WisdomHolman(SplittingMethod):
         x[1:] = x[1] + 1e-6 * unit * numbers[:, None]
         x = jnp.asarray(x)
         pairs = self._pairs(equations, interval, x, ~jnp.eye(len(numbers), dtype=bool))
-        pull = np.asarray(pairs.pull(x[1:]))
+        pull = np.asarray(pairs.pull(x[1:, None] - x[None, 1:]))
         difference = np.asarray(equations.momentum_rate(interval, x, p) / scale)[1:] - pull
         size, of_first = np.abs(pull).max(), float(pairs.mu[0]) / unit**2
         # Where the attraction is so small that the first body hides it, it is not compared.
@@ -292,18 +311,23 @@ class WisdomHolman(SplittingMethod):
             )
 
     def _close(self, equations: Equations, interval: Interval, q: State, p: State) -> Array:
-        """The pairs of bodies that are close at a state in these coordinates."""
-        assert self.encounters is not None
+        """The pairs of bodies that are close at a state in these coordinates, and on the diagonal
+        the bodies at a pericentre."""
         frame, scale = self._frame(equations, interval, q)
         position, momentum = equations.absolute(jnp.zeros_like(q), jnp.zeros_like(q))
         X, V = q + frame.from_bodies(position), p + frame.velocities_of(momentum / scale)
+        point = interval.h, X[1:], V[1:]
         # Radii of Hill spheres, in units of the distance to the first body.
-        radii = self.encounters * jnp.cbrt(frame.masses[1:] / (3 * frame.masses[0]))
-        return close_pairs(interval.h, X[1:], V[1:], radii)
+        radii = (self.encounters or 0) * jnp.cbrt(frame.masses[1:] / (3 * frame.masses[0]))
+        close = close_pairs(*point, radii)
+        if self.pericentres is None:
+            return close
+        mu = self._strength(equations, q) * frame.central_mass()
+        return close | jnp.diag(at_pericentre(*point, mu, self.pericentres))
 
     def compose(self, equations, interval, q, p, stages, parts=None):
         compose = functools.partial(super().compose, equations, interval, q, p, stages)
-        if self.encounters is None:
+        if not self._switches:
             return compose(parts)
 
         def attempt(state):
@@ -320,7 +344,7 @@ class WisdomHolman(SplittingMethod):
 
             return lax.cond(lanewise.on_any(~is_final, rare=False), repetition, lambda: state), None
 
-        # Pairs are judged at both ends: with one that is close at the end only, the step is
+        # Pairs and pericentres are judged at both ends: with one at the end only, the step is
         # repeated from its start.
         close = self._close(equations, interval, q, p)
         start = close, jnp.asarray(False), q, p, no_step_yet(q)
@@ -328,14 +352,20 @@ class WisdomHolman(SplittingMethod):
         return q, p, info
 
     def count(self, equations, interval, q0, p0, q1, p1):
-        if self.encounters is None:
+        if not self._switches:
             return {}
         ends = (self.enter(equations, interval, *state)[:2] for state in ((q0, p0), (q1, p1)))
-        close = jnp.stack([self._close(equations, interval, *state) for state in ends])
-        return {"encounter_steps": jnp.any(close).astype(jnp.int32)}
+        start, end = (self._close(equations, interval, *state) for state in ends)
+        close, of_one = start | end, jnp.eye(len(start), dtype=bool)
+        flags = {}
+        if self.encounters is not None:
+            flags["encounter_steps"] = close & ~of_one
+        if self.pericentres is not None:
+            flags["pericentre_steps"] = close & of_one
+        return {name: jnp.any(flag).astype(jnp.int32) for name, flag in flags.items()}
 
     def in_loop(self, equations, interval, q):
-        is_fixed = self._is_fixed(equations, interval, q) and self.encounters is None
+        is_fixed = self._is_fixed(equations, interval, q) and not self._switches
         return super().in_loop(equations, interval, q) if is_fixed else None
 
     def in_coordinates(self, equations, interval, q):

@@ -78,6 +78,9 @@ def dataset_of(
             add(name, axis_names(name, np.shape(value)[len(batch) :]), value)
     for name, value in zip("tqp", solution.stop or (), strict=False):
         add(f"stop_{name}", [] if name == "t" else of_state, value)
+    jumps = solution.jumps
+    for name, value in () if jumps is None else vars(jumps).items():
+        add(f"jumps.{name}", ["jumps_dim", *of_state][: np.ndim(value) - len(dims)], value)
     for name, values in (coords or {}).items():
         refuse_unit_or_mask(f"coords {name}", values)
     coordinates = {axis: index, **labels, **(coords or {})}
@@ -87,7 +90,8 @@ def dataset_of(
     attributes |= {"num_steps": int(np.ravel(solution.stats["num_steps"])[0])}
     attributes |= {name: _attribute(value) for name, value in (attrs or {}).items()}
     data = xr.Dataset(variables, coordinates, attributes)
-    alike_in = {"t": ("t", "time", "h", "stop_t"), "q": ("q", "stop_q"), "p": ("p", "stop_p")}
+    alike_in = {"t": ("t", "time", "h", "stop_t", "jumps.ts")}
+    alike_in |= {x: (x, f"stop_{x}", f"jumps.{x}s_before", f"jumps.{x}s_after") for x in "qp"}
     for name, text in (units or {}).items():
         for alias in alike_in.get(name, (name,)):
             if alias in data.variables:

@@ -164,7 +164,8 @@ class Solution(eqx.Module):
         Variables: `q`, `p`, `h`; observables by their place in the pytree, joined by points, one
         alone as ``observed``, the first of a list as ``observed.0``; `status` (int8, with
         ``flag_values`` and ``flag_meanings``); the arrays in `stats`; ``stop_t``, ``stop_q``,
-        ``stop_p`` for a run with a `Stop`. NaN stays NaN.
+        ``stop_p`` for a run with a `Stop`; ``jumps.ts``, ``jumps.qs_before`` and all others of
+        `Jumps` for one with jumps, along ``jumps_dim``. NaN stays NaN.
         ``sol.to_xarray().to_netcdf(path, engine="h5netcdf")`` writes it (extra ``export``).
 
         **Raises** `ValueError` for a number of `dims` that is not that of the batch, labels that

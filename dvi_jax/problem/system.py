@@ -212,8 +212,8 @@ def without_jumps(problem: Any) -> Any:
     # Without them a ball would fall through the floor, and no number would show it.
     if getattr(problem, "jumps", ()):
         raise ValueError(
-            "the problem has jumps, such as bounces, and only dvi.integrate makes them: give "
-            "problem.system for the motion between jumps."
+            "the problem has jumps, such as bounces, and only dvi.integrate and dvi.sweep make "
+            "them: give problem.system for the motion between jumps."
         )
     return problem
 

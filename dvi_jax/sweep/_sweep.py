@@ -65,6 +65,7 @@ def sweep(
     **Arguments** otherwise as for `integrate`, and
 
     - `observe`: pytree of observables and reductions. `save`: which states are stored; None: none.
+      With a `jump`, `jumps.count` is stored, and with `save` all of `Jumps`, max_jumps rows each.
     - `units`: of observables (and of t, q, p), name → text, for labels; a store keeps those of
       the first call.
     - `store`: a directory. Each task is written there when it is done; the same call again resumes

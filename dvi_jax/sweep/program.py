@@ -112,6 +112,9 @@ class Lanes(eqx.Module):
             results |= {"t": solution.ts, "q": solution.qs, "p": solution.ps}
         if solution.stop is not None:
             results["stop_t"] = solution.stop.t
+        jumps = {} if solution.jumps is None else vars(solution.jumps)
+        # The states of jumps are saved where others are.
+        results |= {f"jumps.{x}": jumps[x] for x in jumps if x == "count" or save is not None}
         return results | {
             "status": status_code(solution.result).astype(jnp.int8),
             "failed_step": solution.stats["failed_step"],

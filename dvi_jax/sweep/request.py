@@ -17,7 +17,7 @@ from ..integration.arithmetic import Arithmetic
 from ..integration.integrator import Integrator, chosen
 from ..lattices import Given, Lattice
 from ..methods import Method
-from ..observe import Stop
+from ..observe import Jump, Stop
 from ..observe.solution import Save
 from ..problem.paths import as_path
 from ..problem.system import System, check_system, of_problem
@@ -45,6 +45,7 @@ class SweepSettings(TypedDict, total=False):
     integrator: Integrator | None
     observe: Any
     stop: Stop | None
+    jump: Jump | Sequence[Jump] | None
     path: Any
     start: Starts | None
     save: Save | None
@@ -82,6 +83,7 @@ class Request:
     integrator: Any = None
     observe: Any = None
     stop: Any = None
+    jump: Any = None
     path: Any = None
     start: Any = None
     save: Any = None
@@ -107,9 +109,12 @@ class Request:
     def _with_defaults(self) -> "Request":
         """The same, with the defaults of a problem of the library."""
         has_start = self.start is not None or isinstance(self.system, System)
-        system, *values = of_problem(self.system, self.q0, self.p0, self.h, self.args, has_start)
+        values = self.q0, self.p0, self.h, self.args
+        system, *values = of_problem(self.system, *values, has_start, jumps_allowed=True)
         check_system(system, noise_allowed=True)
         fields = dict(zip(("q0", "p0", "h", "args"), values, strict=True))
+        jumps = getattr(self.system, "jumps", None) if self.jump is None else self.jump
+        fields["jump"] = jumps or None
         epsilon = system.strength(self.epsilon)
         return dataclasses.replace(self, system=system, epsilon=epsilon, **fields)
 
@@ -150,6 +155,8 @@ class Request:
             "arithmetic": integrator.arithmetic,
             "layout": integrator.layout,
         }
+        if self.jump is not None:  # stores of sweeps without one are described without it
+            options["jump"] = self.jump
         separate = len({name for name, *_ in list_axes})
         return Sweep(self.system, inputs, start, method, num_steps, options, dims, separate)
 

@@ -15,7 +15,9 @@ from .program import Sweep
 _NAME = re.compile(r"[\w +-]+(\.[\w +-]+)*")
 
 # Names that the result itself uses.
-RESERVED_NAMES = ("status", "failed_step", "residual", "stop_t", "t", "q", "p", "save", "q0", "p0")
+RESERVED_NAMES = (
+    *("status", "failed_step", "residual", "stop_t", "jumps", "t", "q", "p", "save", "q0", "p0"),
+)
 
 
 @dataclass(frozen=True)
@@ -65,10 +67,12 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     if len({*lengths.values()}) > 1:
         first |= {name: "save" for name, n in lengths.items() if n == max(lengths.values())}
     first |= dict.fromkeys("tqp", "save")
+    first |= {x: "jumps_dim" for x in shapes if x.startswith("jumps.") and shapes[x].shape}
     arrays = {}
     for name, array in shapes.items():
         shape = array.shape[1:] if name in first else array.shape
-        dims = own_dims("component" if name in ("q", "p") else f"{name}_dim", shape)
+        is_state = name in ("q", "p") or (name in first and name.startswith("jumps."))
+        dims = own_dims("component" if is_state else f"{name}_dim", shape)
         if name in first:
             dims.insert(0, first[name])
         dtype = np.dtype(array.dtype)

@@ -2,7 +2,7 @@
 
 Each is a function without obligatory arguments that returns a `Problem`. Its entry in `LIBRARY`
 gives the name in run files; `tests/test_library.py` tests every entry. Those with jumps are not in
-it, because only `integrate` makes jumps.
+it, because most commands make no jumps.
 """
 
 from ..base.tables import Table as _Table

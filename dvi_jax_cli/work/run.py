@@ -43,8 +43,8 @@ def run_file(
     - `force`: replace the results of an earlier run there.
     - `progress`: called as ``progress(steps_done, steps)``.
 
-    Writes trajectory.npz (ts, qs, ps, hs and ``observed/<name>``), report.json and pictures. A
-    trajectory that fails is written up to its failure, and ``ok`` is False.
+    Writes trajectory.npz (ts, qs, ps, hs, ``observed/<name>`` and ``jumps/<name>``), report.json
+    and pictures. A trajectory that fails is written up to its failure, and ``ok`` is False.
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
@@ -71,6 +71,8 @@ def run_file(
         arrays = {name: np.asarray(getattr(result, name)) for name in ("ts", "qs", "ps", "hs")}
         leaves = jax.tree.leaves_with_path(result.observed["own"])  # several of a section
         values = {f"observed/{place(path)}": np.asarray(leaf) for path, leaf in leaves}
+        jumps = {} if result.jumps is None else vars(result.jumps)
+        values |= {f"jumps/{name}": np.asarray(value) for name, value in jumps.items()}
         report.write_arrays("trajectory.npz", arrays | values)
         ts, qs, ps, _ = arrays.values()
         if source.jd is None:
@@ -89,7 +91,7 @@ def _arguments(file: RunFile, source: Source) -> dict[str, Any]:
     source.check_start(q0, p0, args)
     method, save = source.method(file.method), dvi.Save(every=file.output.every, final=True)
     run = {"system": source.system, "q0": q0, "p0": p0, "args": args, "method": method}
-    run |= {"save": save, **source.times(file)}
+    run |= {"save": save, "jump": source.jump, **source.times(file)}
     if source.jd is not None:  # a run that is compared with the ephemeris must not leave it
         ts = file.lattice.times if run["h"] is None else (0.0, run["h"] * run["num_steps"])
         span = float(ts[-1] - ts[0])

@@ -118,6 +118,7 @@ class Integration(TomlTable):
     observables: Annotated[dict[str, Text], AfterValidator(_check_names)] | None = key(
         None, 'a table of texts, such as energy = "energy" or drift = "MaxDrift(energy)"'
     )
+    jump: Text | None = key(None, f"{FILE}, a dvi.Jump or a list of them")
 
     @model_validator(mode="after")
     def _times_or_steps(self) -> Any:

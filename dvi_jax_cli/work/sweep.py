@@ -179,6 +179,7 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
         "save": None if file.save is None else save,
         "observe": _observe(file, source),
         "stop": _stop(file, source),
+        "jump": source.jump,
         "lanes_per_task": file.output.lanes_per_task,
     }
     arguments |= {name: _for_sweep(_KEYS.get(name, name), value) for name, value in times.items()}

@@ -27,7 +27,7 @@ from .._errors import (
 )
 from .expressions import parse_method
 from .loader import Loader, in_one_line
-from .schema import COUNT, RunFile, SweepFile, SystemFile, Times
+from .schema import COUNT, Integration, RunFile, SweepFile, SystemFile, Times
 from .table import NO_KEY
 
 
@@ -123,6 +123,18 @@ class Source:
         require(h is not None, "h", NO_KEY, "a number (the system has no default)")
         return h
 
+    @property
+    def jump(self) -> Sequence[dvi.Jump]:
+        """The jumps of the file, or else of the system."""
+        name = getattr(self.file, "jump", None)
+        if name is None:
+            return getattr(self.problem, "jumps", ())
+        jumps = self.loader.load("jump", name)
+        jumps = jumps if isinstance(jumps, list | tuple) else [jumps]
+        fits = all(isinstance(jump, dvi.Jump) for jump in jumps)
+        require(fits, "jump", describe(jumps), "a dvi.Jump or a list of them")
+        return jumps
+
     def times(self, file: RunFile | SweepFile) -> dict[str, Any]:
         """The arguments of `dvi.integrate` that set the times of the steps, and ε."""
         if isinstance(file.lattice, Times):
@@ -169,7 +181,8 @@ def find_source(file: SystemFile, folder: Path) -> Source:
         with as_input_error("system", rule, *kinds, prefix=prefix, text=text):
             target, defect = target(), f"the result of {name!r}"
     if isinstance(target, systems.Problem):
-        require(not target.jumps, "system", f"{defect} has jumps", "a system without jumps")
+        fits = not target.jumps or isinstance(file, Integration)
+        require(fits, "system", f"{defect} has jumps", "a system without jumps")
         return Source(file, loader, target, target.system)
     if isinstance(target, dvi.System):
         return Source(file, loader, None, target)
