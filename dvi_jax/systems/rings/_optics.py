@@ -243,7 +243,7 @@ def _passage(kinds: tuple[RingPart, ...], xs: Any, z: Array, D: Array, chromatic
 
 
 def analysis(
-    ring: Ring, z: Array, six: bool, chromatic: bool, by_part: bool = False
+    ring: Ring, z: Any, six: bool, chromatic: bool, by_part: bool = False
 ) -> tuple[Optics, Any]:
     """See `optics`; also the last correction of the closed orbit. `by_part`: before each piece of
     `pieces_in` and at the end, not at the elements (but for `s`)."""

@@ -33,7 +33,7 @@ class Pieces(NamedTuple):
     row: np.ndarray
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=16)
 def pieces_in(program: RingStructure) -> Pieces:
     """Less code is compiled for these than for tracking: magnets in slices of any number and scheme
     are one sequence of kicks, with drifts between them."""
