@@ -189,6 +189,13 @@ def frequency_diffusion(
     times = times.reshape(2, *(1,) * (halves.ndim - times.ndim), *times.shape[1:])
     check_count(settings, halves, " in each half")
     _, raw = analyse(times, halves, settings, eps)
+    first, second, rate, code = _change_of_leading(raw)
+    return require_success(FrequencyDiffusion(first, second, rate, with_code(code)), throw)
+
+
+@jax.jit
+def _change_of_leading(raw: SpectralLines) -> tuple[Array, Array, Array, Array]:
+    """The leading frequency in each half, the rate of `frequency_diffusion`, and the code."""
     omega, first = raw.s, raw.s[0, ..., 0]
     size = jnp.abs(raw.amplitudes)
     strong = size[1] >= 0.5 * size[0, ..., :1]
@@ -200,7 +207,7 @@ def frequency_diffusion(
     code = jnp.where(lacks_numbers(raw.code), raw.code, 0)
     code = jnp.where(code[0] != 0, code[0], code[1])
     first, second, rate = (jnp.where(code == 0, x, jnp.nan) for x in (first, second, rate))
-    return require_success(FrequencyDiffusion(first, second, rate, with_code(code)), throw)
+    return first, second, rate, code
 
 
 def settings_of(count: Any, window: Any, refine: Any) -> LineSettings:
@@ -301,6 +308,7 @@ def _lattice(ts: Array) -> tuple[Array, Array, Array]:
     return (h + change)[..., 0], (centre + shift)[..., 0], largest_deviation
 
 
+@jax.jit
 def _unevenness(ts: Array, eps: Any) -> Array:
     """Largest deviation from uniform times over the tolerance; NaN if all times are equal.
 

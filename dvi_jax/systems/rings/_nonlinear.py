@@ -14,8 +14,10 @@ from jax import lax
 from jaxtyping import Array
 
 import lanewise
+from lanewise.jaxprs.jaxapi import is_traced
 
 from ...base.checks import array, finite, in_range, known, positive, whole
+from ...base.inputs import real_numbers
 from ...base.printing import printable
 from ...base.progress import bar_of, reporter
 from ...dynamics.frequencies import frequencies, frequency_diffusion
@@ -63,6 +65,7 @@ def detuning(ring: Ring, dp: float = 0.0, action: float = 1e-9, turns: int = 102
     return jnp.linalg.lstsq(terms, change)[0][:2].T / action
 
 
+@jax.jit
 def _signal(o: Optics, z: Array) -> Array:
     """√(2J_k) e^{iφ_k} of the first two modes from z (particles, turns, 6) as (particles, 2,
     turns), where the linear motion has the tune 1/4: far from 0 and 1/2, where lines coincide."""
@@ -103,12 +106,12 @@ def resonance_driving_terms(
             "rings.multipole with length 0 where it is a polynomial."
         )
     optics(ring, dp, chromatic=False)
-    return _driving_terms(ring, jnp.zeros(6).at[5].set(dp), tuple(terms))
+    o, _ = analysis(ring, real_numbers("dp", dp) * np.eye(6)[5], False, False, True)
+    return _driving_terms(ring, o, tuple(terms))
 
 
 @eqx.filter_jit
-def _driving_terms(ring: Ring, z: Array, terms: tuple[str, ...]) -> dict[str, Array]:
-    o, _ = analysis(ring, z, False, False, True)
+def _driving_terms(ring: Ring, o: Optics, terms: tuple[str, ...]) -> dict[str, Array]:
     apply, xs, pieces = maps(four(ring))
     names = np.asarray([ring.program.parts[part].name for part, _ in ring.program.rows])[pieces]
     mine = np.flatnonzero(np.isin(names, (*SLICED_PARTS, "thin", "second_order_bend")))
@@ -178,14 +181,15 @@ def dynamic_aperture(
     angles = np.linspace(0, np.pi, angles) if np.ndim(angles) == 0 else np.asarray(angles)
     limits = array("largest", known("largest", largest, float), (2,), hint="It is (x_max, y_max).")
     in_range("largest", limits, 1e-9, 1.0, "The unit is m.")
-    rays = jnp.stack([limits[0] * np.cos(angles), limits[1] * np.sin(angles)], 1)
+    rays = np.stack([limits[0] * np.cos(angles), limits[1] * np.sin(angles)], 1)
     o, ring = optics(ring, dp, chromatic=False), ring if dp is None else four(ring)
+    orbit = _in_numpy(o.orbit)[0]
 
     def survive(r):
-        z = (1e-6 + r[..., None] * rays[:, None]) @ _XY + o.orbit[:1, None]
+        z = (1e-6 + r[..., None] * rays[:, None]) @ _XY + orbit
         return _pieces(lambda z: ~track(ring, z, turns).lost, progress, z)
 
-    return _first_loss(survive, len(rays), steps, rounds)[:, None] * rays
+    return jax.device_put(_first_loss(survive, len(rays), steps, rounds)[:, None] * rays)
 
 
 def momentum_aperture(
@@ -204,7 +208,7 @@ def momentum_aperture(
     `where`: see `Ring.where`; None: all elements. Other arguments and errors as for
     `dynamic_aperture`. The particle finishes its first turn, followed by `turns` turns.
     """
-    orbit = optics(ring, chromatic=False).orbit
+    orbit = _in_numpy(optics(ring, chromatic=False).orbit)
     first = np.repeat(np.arange(len(ring)) if where is None else ring.where(where), 2)
     in_range("largest", largest, 1e-9, 1.0, "It is Δp/p, not per cent.")
     side = largest * np.resize([-1.0, 1.0], len(first))
@@ -223,11 +227,11 @@ def momentum_aperture(
     finish = jax.jit(jax.vmap(lambda z, first: lanewise.call(end_of_turn, passage, z, first)))
 
     def survive(r):
-        z = jnp.einsum("rs,i->rsi", r * side[:, None], np.eye(6)[5]) + begins[:, None]
-        begin = jnp.broadcast_to(first[:, None], r.shape)
+        z = (r * side[:, None])[..., None] * np.eye(6)[5] + begins[:, None]
+        begin = np.broadcast_to(first[:, None], r.shape)
         return _pieces(lambda z, i: ~track(ring, finish(z, i), turns).lost, progress, z, begin)
 
-    return (_first_loss(survive, len(first), steps, rounds) * side).reshape(-1, 2)
+    return jax.device_put((_first_loss(survive, len(first), steps, rounds) * side).reshape(-1, 2))
 
 
 def frequency_map(
@@ -249,27 +253,44 @@ def frequency_map(
     def tunes_of_halves(z):
         signal = _signal(o, track(ring, z, turns, every=1).z)
         halves = frequency_diffusion(np.arange(turns), signal, throw=False)
-        return jnp.stack([halves.first, halves.second], 1)
+        return _module_of(halves.first).stack([halves.first, halves.second], 1)
 
-    tunes = _pieces(tunes_of_halves, progress, o.orbit[:1] + xy @ _XY) / (2 * np.pi) - 0.25
+    begins = _in_numpy(o.orbit)[:1] + xy @ _XY
+    tunes = _pieces(tunes_of_halves, progress, begins) / (2 * np.pi) - 0.25
     tunes = tunes.reshape(*np.broadcast_shapes(np.shape(x), np.shape(y)), 2, 2)
-    change = jnp.linalg.norm(tunes[..., 1, :] - tunes[..., 0, :], axis=-1)
-    tune = (tunes + o.tune[:2].reshape((1,) * (tunes.ndim - 1) + (2,))) % 1
-    return FrequencyMap(tune[..., 0, :], tune[..., 1, :], jnp.log10(jnp.maximum(change, 1e-16)))
+    xp = _module_of(tunes)
+    change = xp.linalg.norm(tunes[..., 1, :] - tunes[..., 0, :], axis=-1)
+    tune = (tunes + _in_numpy(o.tune)[:2].reshape((1,) * (tunes.ndim - 1) + (2,))) % 1
+    diffusion = xp.log10(xp.maximum(change, 1e-16))
+    return jax.device_put(FrequencyMap(tune[..., 0, :], tune[..., 1, :], diffusion))
 
 
-def _first_loss(survive: Callable, rays: int, steps: int, rounds: int) -> Array:
+# JAX would compile each operation for each shape; it is needed for what is traced only.
+
+
+def _in_numpy(x: Any) -> Any:
+    return x if is_traced(x) else np.asarray(x)
+
+
+def _module_of(x: Any) -> Any:
+    """`jax.numpy` for what is traced, otherwise NumPy."""
+    return jnp if is_traced(x) else np
+
+
+def _first_loss(survive: Callable, rays: int, steps: int, rounds: int) -> Any:
     """The last r of each ray before the first loss, in (0, 1]."""
-    low, width = jnp.zeros((rays, 1)), jnp.ones((rays, 1))
+    low, width = np.zeros((rays, 1)), np.ones((rays, 1))
     for _ in range(whole("rounds", rounds)):
         shares = np.arange(1, whole("steps", steps, 2) + 1)[None] / steps
-        survivals = jnp.sum(jnp.cumprod(survive(low + width * shares), 1), 1, keepdims=True)
+        survives = survive(low + width * shares)
+        xp = _module_of(survives)
+        survivals = xp.sum(xp.cumprod(survives, 1), 1, keepdims=True)
         low = low + width * survivals / steps
-        width = jnp.where(survivals == steps, 0.0, width / steps)
+        width = xp.where(survivals == steps, 0.0, width / steps)
     return low[:, 0]
 
 
-def _pieces(function: Callable, progress: Report, *arrays: Array) -> Array:
+def _pieces(function: Callable, progress: Report, *arrays: Any) -> Any:
     """`function` of particles, arrays (…, 6) and (…), in batches of one size, with progress."""
     shape = arrays[0].shape[:-1]
     flat = [a.reshape(-1, *a.shape[len(shape) :]) for a in arrays]
@@ -282,8 +303,8 @@ def _pieces(function: Callable, progress: Report, *arrays: Array) -> Array:
     with reporter(progress, bar_of("particles", (), columns)) as report:
         for i in range(0, N := len(flat[0]), size):
             indices = np.minimum(np.arange(i, i + size), N - 1)
-            outs.append(jax.block_until_ready(function(*(a[indices] for a in flat))))
+            outs.append(_in_numpy(function(*(a[indices] for a in flat))))
             if report:
                 report((min(i + size, N), N))
-    out = jnp.concatenate(outs)[:N]
+    out = _module_of(outs[0]).concatenate(outs)[:N]
     return out.reshape(*shape, *out.shape[1:])

@@ -1,5 +1,6 @@
 """Closed orbit, one-turn matrix, tunes, Twiss functions and dispersion of a ring."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,24 +11,21 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-import lanewise
 from lanewise.jaxprs.jaxapi import is_traced
 
 from ...base.checks import array, in_range, instance
 from ...base.inputs import real_numbers
 from ...base.printing import printable
-from ._maps import KICKS, Particle, RingPart, distinct, forward
+from ._maps import Particle, RingPart, forward
 from ._parts import pieces_of
+from ._pieces import SLICED_PARTS, padded, pieces_in
 from ._ring import Ring
-from ._turn import Passage, coordinates
+from ._turn import Passage, compiled, coordinates, parameters_of
 
-SLICED_PARTS = "straight", "bend", "exact_straight", "exact_bend", "at_exact_bend"
 _MOST_ITERATIONS, _EXTRA_ITERATIONS, _SMALL = 15, 3, 1e-9
 """Newton iterations at most, and after the first correction that is smaller than the last one."""
 _EQUAL = 1e-12
 """Difference of two eigenvalues that is round-off."""
-_KICKS = 12
-"""Most kicks in a piece of a magnet, so that its phase advance is less than 2π."""
 _UNSTABLE = 1e-11
 """Area in phase space of an eigenvector of length 1, below which it is round-off."""
 
@@ -70,16 +68,16 @@ def one_turn(ring: Ring, z: Any, epsilon: Any = 0.0) -> Array:
     differentiated repeatedly in every mode. See `track` for the coordinates.
     """
     instance("ring", ring, Ring, "a rings.Ring")
-    passage = Passage.from_ring(ring)
+    z, epsilon = coordinates("z", z), jnp.asarray(epsilon, float)
+    return _image(Passage.from_ring(ring), z.reshape(-1, 6), epsilon).reshape(z.shape)
 
+
+@eqx.filter_jit
+def _image(passage: Passage, z: Array, epsilon: Array) -> Array:
     def image(passage, z, epsilon):
         return jnp.stack(passage.image(Particle(*z), 0, epsilon))
 
-    def turn_map(z):
-        return lanewise.call(image, passage, z, jnp.asarray(epsilon, float))
-
-    z = coordinates("z", z)
-    return jax.vmap(turn_map)(z.reshape(-1, 6)).reshape(z.shape) if z.ndim > 1 else turn_map(z)
+    return compiled(image, (None, 0, None), (passage, z, epsilon))
 
 
 def closed_orbit(ring: Ring, dp: Any = None, guess: Any = None, epsilon: Any = 0.0) -> Array:
@@ -148,7 +146,8 @@ def _analyse(ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, sta
         if not is_traced(dp):
             in_range("dp", dp, -1.0, 1.0, "It is Δp/p, not per cent.")
     if not six:
-        z = z.at[4].set(0.0).at[5].set(0.0 if dp is None else dp)
+        xp = jnp if is_traced(z) or is_traced(dp) else np
+        z = xp.where(np.arange(6) < 4, z, np.eye(6)[5] * xp.asarray(0.0 if dp is None else dp))
     twiss, change = analysis(ring, z, six, chromatic)
     if is_traced(change):
         return twiss
@@ -172,38 +171,13 @@ def four(ring: Ring) -> Ring:
     """The ring with its cavities off."""
     columns = dict(ring.columns)
     if "voltage" in columns:
-        columns["voltage"] = jnp.zeros_like(columns["voltage"])
+        columns["voltage"] = jax.device_put(np.zeros(np.shape(columns["voltage"])))
     return eqx.tree_at(lambda other: other.columns, ring, columns)
 
 
-def _kick_shares(part: RingPart) -> list[np.ndarray]:
-    """The pieces of a part, as kicks over its length: their sums are shares of its length."""
-    if part.name in SLICED_PARTS:
-        kicks, n = KICKS[part.scheme], part.slices
-        limit = max(1, _KICKS // len(kicks))
-        return [np.array([0.0, *kicks * min(limit, n - i)]) / n for i in range(0, n, limit)]
-    count = {"solenoid": 8, "second_order_bend": part.slices}.get(part.name, 1)
-    return [np.array([1 / count])] * count
-
-
-def maps(ring: Ring) -> tuple[Callable, Any, np.ndarray]:
-    """``apply(z, x)``, the map of a piece of a part of an element, x for all pieces in a row, and
-    for each piece the number of its part in `ring.program.rows`.
-
-    Less code is compiled than for tracking: magnets in slices of any number and scheme are one
-    sequence of kicks, with drifts between them.
-    """
-    passage = Passage.from_ring(ring)
-    parts, thick = passage.parts, {"scheme": 2, "slices": 1}
-    order = max(p.order for p in parts)
-    changes = {**dict.fromkeys(SLICED_PARTS, thick), "second_order_bend": {"slices": 1}}
-    kinds = [p._replace(order=order, **changes.get(p.name, {})) for p in parts]
-    all_kinds = distinct(kinds)
-    numbers = np.asarray([all_kinds.index(kind) for kind in kinds], np.int32)
-    pieces = [_kick_shares(p) for p in parts]
-    part, width = passage.numbers["part"], max(len(k) for p in pieces for k in p)
-    steps = np.stack([np.pad(k, (0, width + 1 - len(k))) for i in part for k in pieces[i]])
-    rows = np.repeat(np.arange(len(part)), [len(pieces[i]) for i in part])
+@functools.lru_cache(maxsize=64)
+def map_of(kinds: tuple[RingPart, ...]) -> Callable:
+    """``apply(z, x)`` of `maps`; nothing happens in a piece with the number after the last."""
 
     def apply(z, columns):
         par, part, steps = columns
@@ -222,85 +196,147 @@ def maps(ring: Ring) -> tuple[Callable, Any, np.ndarray]:
                 return lambda z: lax.scan(kick, z, jnp.stack([steps[:-1], steps[1:]], 1))[0]
             return lambda z: forward(pieces, z, share, 0, 1)
 
-        return lax.switch(part, [kind_map(kind) for kind in all_kinds], z)
+        return lax.switch(part, [*map(kind_map, kinds), lambda z: z], z)
 
     # Recomputed in reverse mode: otherwise each part stores what every kind of part would need.
-    table = jax.tree.map(lambda column: column[rows], passage.rows)
-    return jax.checkpoint(apply), (table, numbers[part][rows], steps), rows
+    return jax.checkpoint(apply)
 
 
-@eqx.filter_jit
+def maps(ring: Ring) -> tuple[Callable, Any, np.ndarray]:
+    """``apply(z, x)``, the map of a piece of a part of an element, x for all pieces in a row, and
+    for each piece the number of its part in `ring.program.rows`."""
+    kinds, numbers, steps, rows = pieces_in(ring.program)
+    table = parameters_of(ring.columns, ring.program, rows)
+    return map_of(kinds), (table, numbers, steps), rows
+
+
+@functools.partial(jax.jit, static_argnames=("kinds", "chromatic"))
+def _passage(kinds: tuple[RingPart, ...], xs: Any, z: Array, D: Array, chromatic: bool):
+    """The orbit z and its derivative M after each piece, and the derivative of M at the end along D
+    (NaN if not `chromatic`). A batch of directions of the derivative is one program."""
+    apply = map_of(kinds)
+
+    def states(xs, z):
+        def row(z, x):
+            z = apply(z, x)
+            return z, jnp.stack(z)
+
+        end, zs = lax.scan(row, Particle(*z), xs)
+        return zs, jnp.stack(end)
+
+    def slopes(xs, v, z):
+        (zs, _), (of_zs, of_end) = jax.jvp(functools.partial(states, xs), (z,), (v,))
+        return (of_zs, of_end), zs
+
+    def along(xs, z, D, v):
+        if not chromatic:
+            (of_zs, _), zs = slopes(xs, v, z)
+            return zs, of_zs, jnp.full(6, jnp.nan)
+        (of_zs, _), (_, of_end), zs = jax.jvp(
+            functools.partial(slopes, xs, v), (z,), (D,), has_aux=True
+        )
+        return zs, of_zs, of_end
+
+    # Eight directions fill a register.
+    zs, Ms, dM = compiled(along, (None, None, None, 0), (xs, z, D, np.eye(8, 6)))
+    return zs[0], jnp.moveaxis(Ms[:6], 0, 2), dM[:6].T
+
+
 def analysis(
-    ring: Ring, z: Array, six: bool, chromatic: bool, by_part: bool = False
-) -> tuple[Optics, Array]:
+    ring: Ring, z: Any, six: bool, chromatic: bool, by_part: bool = False
+) -> tuple[Optics, Any]:
     """See `optics`; also the last correction of the closed orbit. `by_part`: before each piece of
-    `maps` and at the end, not at the elements (but for `s`)."""
+    `pieces_in` and at the end, not at the elements (but for `s`)."""
+    if any(map(is_traced, jax.tree.leaves((ring, z)))):
+        return _compiled_analysis(ring, z, six, chromatic, by_part)
+    # In NumPy, so that little has to be compiled: nothing for a second ring of the same parts.
+    ring, z = jax.tree.map(np.asarray, (ring, z))
+    with np.errstate(all="ignore"):
+        twiss, size = _analysis(np, ring, z, six, chromatic, by_part)
+    return jax.device_put(twiss), size
+
+
+def _analysis(xp: Any, ring: Ring, z: Any, six: bool, chromatic: bool, by_part: bool):
+    """With the functions of NumPy or of JAX, `xp`."""
     c, shift, n, (e_zeta, e_delta) = ring.columns, 0.0, 6 if six else 4, np.eye(6)[4:]
     if six:
         # The change of ζ per turn of a particle that keeps its phase in the cavities.
         active = c["voltage"] != 0
-        slip = jnp.where(active, c["slip"] / jnp.where(active, c["wave_number"], 1.0), 0.0)
-        shift = -jnp.sum(slip) / jnp.sum(active)
-    apply, xs, pieces = maps(ring if six else four(ring))
-
-    def states(z):
-        zs = lax.scan(lambda z, x: (apply(z, x),) * 2, Particle(*z), xs)[1]
-        zs = jnp.concatenate([z[None], jnp.stack(zs, 1)])
-        return zs, zs
-
-    linear = jax.jacfwd(states, has_aux=True)
+        slip = xp.where(active, c["slip"] / xp.where(active, c["wave_number"], 1.0), 0.0)
+        shift = -xp.sum(slip) / xp.sum(active)
+    (_, xs, pieces), kinds = maps(ring if six else four(ring)), pieces_in(ring.program).kinds
+    rows = len(pieces) + 1
+    if xp is np:
+        xs = padded(xs, len(kinds), rows - 1)
 
     def iterate(state):
         z, D, _, count = state
-        if chromatic:
-            (Ms, zs), (dMs, _) = jax.jvp(linear, (z,), (D,))
-        else:
-            (Ms, zs), dMs = linear(z), jnp.full((1, 6, 6), jnp.nan)
+        zs, Ms, dM = map(xp.asarray, _passage(kinds, xs, z, D, chromatic))
+        zs = xp.concatenate([z[None], zs[: rows - 1]])
+        Ms = xp.concatenate([np.eye(6)[None], Ms[: rows - 1]])
         M = Ms[-1]
         # D: change of the orbit if each turn is longer by the slip, so that δ changes by 1.
-        right = jnp.stack([zs[-1] - z - shift * e_zeta, e_zeta if six else M[:, 5]], 1)[:n]
-        change, D = jnp.pad(jnp.linalg.solve(np.eye(n) - M[:n, :n], right), ((0, 6 - n), (0, 0))).T
+        right = xp.stack([zs[-1] - z - shift * e_zeta, e_zeta if six else M[:, 5]], 1)[:n]
+        solution = _solve(xp, np.eye(n) - M[:n, :n], right)
+        change, D = xp.pad(solution, ((0, 6 - n), (0, 0))).T
         slip = 1 / D[5] if six else -(M @ (D + e_delta))[4]
         D = D * slip if six else D + e_delta
-        size = jnp.max(jnp.abs(change))
-        count = jnp.where((count > 0) | (size < _SMALL), count + 1, 0)
-        return z + change, D, (zs, Ms, dMs[-1], D, slip, size), count
+        size = xp.max(xp.abs(change))
+        count = xp.where((count > 0) | (size < _SMALL), count + 1, 0)
+        return z + change, D, (zs, Ms, dM, D, slip, size), count
 
-    shapes = (rows := len(xs[-1]) + 1, 6), (rows, 6, 6), (6, 6), (6,), (), ()
-    begin = z, jnp.asarray(e_delta), tuple(jnp.full(x, jnp.nan) for x in shapes), jnp.asarray(0)
-    (*_, (zs, Ms, dM, D, slip, size), _), _ = lax.scan(
-        lambda s, _: (lax.cond(s[3] > _EXTRA_ITERATIONS, lambda s: s, iterate, s), None),
-        begin,
-        None,
-        _MOST_ITERATIONS,
-    )
-    zs, Ms, slip = (jnp.where(size < _SMALL, x, jnp.nan) for x in (zs, Ms, slip))
-    v, chromaticity = _modes(Ms[-1, :n, :n], dM[:n, :n])
-    vs = jnp.einsum("rij,kj->rki", Ms[:, :n, :n], v)
-    upright = _upright(ring, pieces, vs)
-    x, px = (jnp.diagonal(upright[:, :, i::2], axis1=1, axis2=2) for i in (0, 1))
-    mu = jnp.angle(x[1:] * jnp.conj(x[:-1]))
-    mu = jnp.where(np.arange(n // 2)[None] < 2, (mu + 0.5) % (2 * np.pi) - 0.5, mu)
-    mu = jnp.concatenate([jnp.zeros((1, n // 2)), jnp.cumsum(mu, 0)])
-    Ds = jnp.real(vs[:, 2] / vs[:, 2, 5:]) if six else Ms @ D
-    elements = np.asarray([element for _, element in ring.program.rows])[pieces]
+    shapes = (rows, 6), (rows, 6, 6), (6, 6), (6,), (), ()
+    state = z, xp.asarray(e_delta), tuple(xp.full(x, np.nan) for x in shapes), xp.asarray(0)
+    if xp is np:
+        for _ in range(_MOST_ITERATIONS):
+            state = state if state[3] > _EXTRA_ITERATIONS else iterate(state)
+    else:
+        state, _ = lax.scan(
+            lambda s, _: (lax.cond(s[3] > _EXTRA_ITERATIONS, lambda s: s, iterate, s), None),
+            state,
+            None,
+            _MOST_ITERATIONS,
+        )
+    *_, (zs, Ms, dM, D, slip, size), _ = state
+    zs, Ms, slip = (xp.where(size < _SMALL, x, np.nan) for x in (zs, Ms, slip))
+    v, chromaticity = _modes(Ms[-1, :n, :n], dM[:n, :n], xp)
+    vs = xp.einsum("rij,kj->rki", Ms[:, :n, :n], v)
+    upright = _upright(xp, ring, pieces, vs)
+    x, px = (xp.diagonal(upright[:, :, i::2], axis1=1, axis2=2) for i in (0, 1))
+    mu = xp.angle(x[1:] * xp.conj(x[:-1]))
+    mu = xp.where(np.arange(n // 2)[None] < 2, (mu + 0.5) % (2 * np.pi) - 0.5, mu)
+    mu = xp.concatenate([xp.zeros((1, n // 2)), xp.cumsum(mu, 0)])
+    Ds = xp.real(vs[:, 2] / vs[:, 2, 5:]) if six else Ms @ D
+    elements = np.asarray(ring.program.rows)[pieces, 1]
     index = np.searchsorted(elements, np.arange(len(ring) + 1))
     index, tune = np.arange(rows) if by_part else index, mu[-1] / (2 * np.pi)
+    places = xp.asarray(ring.places)
     twiss = Optics(
-        s=ring.places,
+        s=places,
         orbit=zs[index],
-        beta=jnp.abs(x[index, :2]) ** 2,
-        alpha=-jnp.real(jnp.conj(x) * px)[index, :2],
+        beta=xp.abs(x[index, :2]) ** 2,
+        alpha=-xp.real(xp.conj(x) * px)[index, :2],
         mu=mu[index],
         dispersion=Ds[index, :4],
         modes=vs[index],
-        gamma=jnp.sqrt(jnp.imag(jnp.conj(x) * px)[index, 0]),
+        gamma=xp.sqrt(xp.imag(xp.conj(x) * px)[index, 0]),
         matrix=Ms[index],
-        tune=jnp.abs(tune),
-        chromaticity=jnp.sign(tune) * chromaticity,
-        compaction=slip / ring.places[-1],
+        tune=xp.abs(tune),
+        chromaticity=xp.sign(tune) * chromaticity,
+        compaction=slip / places[-1],
     )
     return twiss, size
+
+
+_compiled_analysis = eqx.filter_jit(functools.partial(_analysis, jnp))
+
+
+def _solve(xp: Any, A: Any, b: Any) -> Any:
+    """The solution of A x = b; not finite for a singular A, for which NumPy raises an error."""
+    try:
+        return xp.linalg.solve(A, b)
+    except np.linalg.LinAlgError:
+        return np.full(b.shape, np.nan)
 
 
 _FRAMES: dict[str, Callable] = {
@@ -312,52 +348,53 @@ _FRAMES: dict[str, Callable] = {
 """The angle about the s-axis to the frame inside of these parts, from the columns of a ring."""
 
 
-def _upright(ring: Ring, pieces: np.ndarray, v: Array) -> Array:
+def _upright(xp: Any, ring: Ring, pieces: np.ndarray, v: Any) -> Any:
     """Vectors v before each piece and at the end, in axes that are not rolled or tilted: in those
     of a magnet that is rolled by π/2, mode 1 has no component along x, whose phase is measured."""
     part, element = np.asarray(ring.program.rows).T
     names = np.asarray([p.name for p in ring.program.parts])[part]
-    angle = jnp.zeros(len(names))
+    angle = np.zeros(len(names))
     for frame, turn in _FRAMES.items():
         last = names == f"{frame}_out"
         # A matrix in the place of a magnet has no affine map at its end.
         first = (names == f"{frame}_in") & np.isin(element, element[last])
         if last.any():
-            angle += (first * 1.0 - last) * turn(ring.columns)[element]
-    angle = jnp.append(jnp.zeros(1), jnp.cumsum(angle)[pieces])[:, None, None]
-    cos, sin, x, y = jnp.cos(angle), jnp.sin(angle), v[..., :2], v[..., 2:4]
-    return jnp.concatenate([cos * x - sin * y, cos * y + sin * x, v[..., 4:]], -1)
+            angle = angle + (first * 1.0 - last) * xp.asarray(turn(ring.columns))[element]
+    angle = xp.append(xp.zeros(1), xp.cumsum(angle)[pieces])[:, None, None]
+    cos, sin, x, y = xp.cos(angle), xp.sin(angle), v[..., :2], v[..., 2:4]
+    return xp.concatenate([cos * x - sin * y, cos * y + sin * x, v[..., 4:]], -1)
 
 
-def _modes(M: Array, dM: Array) -> tuple[Array, Array]:
+def _modes(M: Any, dM: Any, xp: Any = jnp) -> tuple[Any, Any]:
     """Vectors v_k of the normal modes of M, v_k† S v_k = 2i, in the order of the planes, with a
     real component in their own plane, and the derivative of their tunes by δ; NaN if unstable."""
     n = len(M)
 
     def area(v):
         """Of x and px, y and py, …"""
-        return jnp.imag(jnp.conj(v[::2]) * v[1::2])
+        return xp.imag(xp.conj(v[::2]) * v[1::2])
 
-    _, V = jnp.linalg.eig(lax.stop_gradient(M))
+    # NumPy raises an error for NaN.
+    V = xp.linalg.eig(xp.nan_to_num(M if xp is np else lax.stop_gradient(M)))[1] + 0j
     areas, order = area(V), []
-    penalty = jnp.where(jnp.sum(areas, 0) > _UNSTABLE, 0.0, np.inf)
-    stable = jnp.sum(penalty == 0) == n // 2
+    penalty = xp.where(xp.sum(areas, 0) > _UNSTABLE, 0.0, np.inf)
+    stable = xp.sum(penalty == 0) == n // 2
     for plane in range(n // 2):
-        order.append(jnp.argmax(areas[plane] - penalty))
-        penalty = penalty.at[order[-1]].set(np.inf)
-    V = jnp.where(stable, V[:, jnp.stack(order)], jnp.nan)
-    V = jnp.concatenate([V, jnp.conj(V)], 1)
-    W = jnp.linalg.inv(V)
+        order.append(xp.argmax(areas[plane] - penalty))
+        penalty = xp.where(np.arange(n) == order[-1], np.inf, penalty)
+    V = xp.where(stable, V[:, xp.stack(order)], xp.nan)
+    V = xp.concatenate([V, xp.conj(V)], 1)
+    W = xp.linalg.inv(V)
     # Newton's method, W M V diagonal with W V = 1, for the derivatives, which `eig` does not have.
     for _ in range(2):
         R = W @ M @ V
-        r = jnp.diagonal(R)
+        r = xp.diagonal(R)
         gaps = r[None] - r[:, None]
-        equal = jnp.abs(gaps) < _EQUAL  # itself, or a mode of equal tune in another plane
-        X = jnp.where(equal, 0.0, R / jnp.where(equal, 1.0, gaps))
+        equal = xp.abs(gaps) < _EQUAL  # itself, or a mode of equal tune in another plane
+        X = xp.where(equal, 0.0, R / xp.where(equal, 1.0, gaps))
         V, W = V + V @ X, W - X @ W + X @ X @ W
     V, W = V[:, : n // 2], W[: n // 2]
-    change = jnp.sum(W @ dM * V.T, 1) / jnp.sum(W @ M * V.T, 1)
-    component = jnp.diagonal(V[::2])
-    size = component / jnp.abs(component) * jnp.sqrt(jnp.sum(area(V), 0))
+    change = xp.sum(W @ dM * V.T, 1) / xp.sum(W @ M * V.T, 1)
+    component = xp.diagonal(V[::2])
+    size = component / xp.abs(component) * xp.sqrt(xp.sum(area(V), 0))
     return (V / size[None]).T, change.imag / (2 * np.pi)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -108,7 +109,7 @@ class Ring(eqx.Module):
                             for element in elements])
             for name, shape in sorted(names.items())
         }  # fmt: skip
-        self.columns = {name: jnp.asarray(column) for name, column in columns.items()}
+        self.columns = jax.device_put(columns)  # `jnp.asarray` compiles a program
         self.extra = {}
 
     def __str__(self) -> str:
@@ -143,7 +144,10 @@ class Ring(eqx.Module):
     @property
     def places(self) -> Array:
         """s at the entrance of each element and at the end [m], shape (elements + 1,)."""
-        return jnp.concatenate([jnp.zeros(1), jnp.cumsum(self.columns["length"])])
+        length = self.columns["length"]
+        if is_traced(length):
+            return jnp.concatenate([jnp.zeros(1), jnp.cumsum(length)])
+        return jax.device_put(np.append(0.0, np.cumsum(length)))
 
     @property
     def period(self) -> Array:
@@ -190,7 +194,12 @@ class Ring(eqx.Module):
                     f"{name} must be one number or {len(numbers)}, one for each element that "
                     f"matches {selection!r}, got shape {value.shape}."
                 )
-            columns[name] = columns[name].at[numbers].set(value)
+            if is_traced(value) or is_traced(columns[name]):
+                columns[name] = columns[name].at[numbers].set(value)
+            else:
+                column = np.array(columns[name])  # JAX would compile it
+                column[numbers] = value
+                columns[name] = jax.device_put(column)
         return eqx.tree_at(lambda ring: ring.columns, self, columns)
 
     def _label(self, i: int) -> str:

@@ -1,7 +1,7 @@
 """One turn of one particle, its inverse, and its transposed derivative."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,11 +12,12 @@ from jax import lax
 from jaxtyping import Array
 
 import lanewise
+from lanewise.jaxprs.jaxapi import is_traced, linear_map
 
 from ...base.inputs import real_numbers
 from ._maps import APERTURES, Particle, RingPart, forward, pull_back
 from ._parts import pieces_of
-from ._ring import Ring
+from ._ring import Ring, RingStructure
 
 LARGEST = 1.0
 """A particle with a larger coordinate than this (x, px, y, py, δ) is lost, as in pyAT."""
@@ -72,6 +73,58 @@ def _record(flight: Flight, z: Particle, passes: Any, number: Rows, turn: Any) -
     return lax.cond(lanewise.on_any(is_lost), note, lambda: flight._replace(z=z))
 
 
+def parameters_of(columns: Rows, program: RingStructure, rows: Any) -> Rows:
+    """The columns of elements as columns of `rows` of the parts."""
+    element = np.asarray(program.rows, np.int32)[rows, 1]
+    # In NumPy, if it is possible: JAX would compile each of them.
+    return {
+        name: (column if is_traced(column) else np.asarray(column))[element]
+        for name, column in columns.items()
+    }
+
+
+def compiled(function: Callable, axes: Sequence[int | None], args: tuple) -> Any:
+    """`function` of one particle for a batch, as machine code; its derivative in forward mode, too.
+
+    `axes`: of each of its arguments. JAX and XLA compute the derivative in reverse mode, and those
+    of the derivative.
+    """
+    operands, tree = jax.tree.flatten(args)
+    axes = [a for a, x in zip(axes, args, strict=True) for _ in jax.tree.leaves(x)]
+    trees: list[Any] = []
+
+    def values(*operands):
+        out, out_tree = jax.tree.flatten(function(*jax.tree.unflatten(tree, operands)))
+        trees.append(out_tree)
+        return out
+
+    def rule(operands, changes):
+        moving = [i for i, c in changes.items() if c.dtype != jax.dtypes.float0]
+        vectors = [changes[i] for i in moving]
+
+        def change(operands, vectors):
+            def of(*new):
+                point = dict(enumerate(operands)) | dict(zip(moving, new, strict=True))
+                return values(*point.values())
+
+            return jax.jvp(of, [operands[i] for i in moving], vectors)[1]
+
+        batch = axes, [axes[i] for i in moving]
+        definition = jax.vmap(change, batch)
+
+        def pull(operands, cotangents):
+            return jax.linear_transpose(functools.partial(definition, operands), vectors)(
+                cotangents
+            )[0]
+
+        push = jax.vmap(functools.partial(lanewise.call, change), batch)
+        return linear_map(push, pull, definition, operands, vectors)
+
+    machine = jax.vmap(functools.partial(lanewise.call, values), axes)
+    outs = lanewise.with_derivative(machine, rule, operands)
+    return jax.tree.unflatten(trees[0], outs)
+
+
 class Passage(eqx.Module):
     """The parts of the elements of a ring in the order of passage.
 
@@ -89,7 +142,7 @@ class Passage(eqx.Module):
     def from_ring(cls, ring: Ring) -> "Passage":
         part, element = np.asarray(ring.program.rows, np.int32).T
         rows, slopes = (
-            {name: column[element] for name, column in columns.items()}
+            parameters_of(columns, ring.program, slice(None))
             for columns in (ring.columns, ring.extra)
         )
         ends = np.append(element[1:] != element[:-1], True)
