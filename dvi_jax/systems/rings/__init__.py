@@ -40,4 +40,5 @@ from ._optics import (
 from ._problem import Turn as Turn, problem as problem
 from ._readers import from_at as from_at, load as load
 from ._ring import Ring as Ring
+from ._touschek import touschek_lifetime as touschek_lifetime
 from ._track import Tracked as Tracked, track as track

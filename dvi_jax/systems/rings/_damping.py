@@ -48,7 +48,7 @@ def radiating(ring: Ring, where: Where | None = "*", mass: float = ELECTRON) -> 
     ```python
     ring = rings.radiating(rings.Ring([rings.bend("B", 2.0, 0.1)], energy=3e9))
     print(f"{-3e9 * rings.one_turn(ring, jnp.zeros(6))[5]:.1f}")
-    # 5705.7
+    # 5702.1
     ```
     """
     instance("ring", ring, Ring, "a rings.Ring")

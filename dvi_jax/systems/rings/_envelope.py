@@ -70,6 +70,18 @@ def equilibrium(ring: Ring, guess: Array | None = None, epsilon: float = 0.0) ->
 
     **Source** Ohmi, Hirata & Oide 1994, *Phys. Rev. E* 49, 751. Between the kicks of a magnet pyAT
     leaves out the damping of the covariances.
+
+    **Example** The horizontal emittance of a cell with a cavity:
+
+    ```python
+    cell = [rings.quadrupole("QF", 0.4, k1=1.3), rings.bend("B", 1.5, np.pi / 16),
+            rings.quadrupole("QD", 0.4, k1=-1.3), rings.bend("B", 1.5, np.pi / 16),
+            rings.cavity("RF", 0.0, voltage=1e-4, frequency=5e8)]
+    ring = rings.in_phase(rings.radiating(rings.Ring(cell, energy=1e9)))
+    beam = rings.equilibrium(ring)
+    print(f"{1e9 * beam.emittance[0]:.2f} nm, loss {beam.loss:.1f} eV")
+    # 125.05 nm, loss 723.7 eV
+    ```
     """
     instance("ring", ring, Ring, "a rings.Ring")
     ring, values = ring.at(real_numbers("epsilon", epsilon)), {}

@@ -11,7 +11,7 @@ from ._maps import KICKS, Parameters, Particle, Piece, RingPart, near_identity
 
 ELECTRON = 510998.95069
 """Rest energy of an electron [eV], CODATA 2022."""
-_RADIUS, _ACTION = 2.8179403205e-15, 1.973269804e-7
+RADIUS, _ACTION = 2.8179403205e-15, 1.973269804e-7
 """The classical radius of an electron [m], and ħc [eV m]."""
 _ITERATIONS = 3
 """Of the inverse of a kick: each reduces the error by the relative loss of energy in the kick."""
@@ -22,7 +22,7 @@ Kick = Callable[[Particle, Any, Parameters, int], Particle]
 def constants(energy: float, mass: float) -> dict[str, float]:
     """The parameters of a magnet that radiates: `loss` = 2rγ³/3 [m] with the classical radius r of
     the particle, and `excitation` [m], whose square 55 ƛ r γ⁵/(24 √3) is that of the diffusion."""
-    gamma, radius = energy / mass, _RADIUS * ELECTRON / mass
+    gamma, radius = energy / mass, RADIUS * ELECTRON / mass
     diffusion = 55 / (24 * math.sqrt(3)) * _ACTION / mass * radius * gamma**5
     return {"loss": 2 / 3 * radius * gamma**3, "excitation": math.sqrt(diffusion)}
 
