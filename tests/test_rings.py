@@ -420,12 +420,12 @@ def test_losses_agree_with_pyat(at):
 
 def test_what_cannot_be_read_is_listed(at):
     e = at.elements
-    radiates = e.Quadrupole("QR", 0.3, 1.0, PassMethod="StrMPoleSymplectic4RadPass")
+    radiates = e.Quadrupole("QR", 0.3, 1.0, PassMethod="StrMPoleSymplectic4QuantPass")
     fringe = e.Dipole("BX", 1.0, 0.1, FringeBendEntrance=3)
     lattice = at.Lattice([e.Drift("D", 1.0), radiates, fringe], energy=1e9)
     with pytest.raises(ValueError, match="2 of 3 elements have no counterpart") as error:
         rings.from_at(lattice)
-    assert "1: QR (Quadrupole, StrMPoleSymplectic4RadPass): radiation is not" in str(error.value)
+    assert "1: QR (Quadrupole, StrMPoleSymplectic4QuantPass): radiation is not" in str(error.value)
     assert "2: BX (Dipole, BndMPoleSymplectic4Pass): FringeBendEntrance = 3" in str(error.value)
 
 

@@ -1,5 +1,11 @@
 """Storage rings: lattices of magnets as maps, with gradients and invariants."""
 
+from ._damping import (
+    in_phase as in_phase,
+    radiating as radiating,
+    radiation_integrals as radiation_integrals,
+    tapered as tapered,
+)
 from ._elements import (
     Element as Element,
     aperture as aperture,
@@ -15,6 +21,7 @@ from ._elements import (
     sextupole as sextupole,
     solenoid as solenoid,
 )
+from ._envelope import Equilibrium as Equilibrium, equilibrium as equilibrium
 from ._nonlinear import (
     FrequencyMap as FrequencyMap,
     detuning as detuning,
@@ -33,4 +40,5 @@ from ._optics import (
 from ._problem import Turn as Turn, problem as problem
 from ._readers import from_at as from_at, load as load
 from ._ring import Ring as Ring
+from ._touschek import touschek_lifetime as touschek_lifetime
 from ._track import Tracked as Tracked, track as track

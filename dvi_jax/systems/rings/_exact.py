@@ -5,7 +5,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ._maps import KICKS, Parameters, Particle, Piece, RingPart, field, near_identity, quarters
+from ._maps import (
+    KICKS,
+    Parameters,
+    Particle,
+    Piece,
+    RingPart,
+    curved_kick,
+    field,
+    near_identity,
+    quarters,
+)
+from ._radiation import emit
 
 
 def rotation(x: Any, y: Any, angle: Any) -> tuple[Any, Any]:
@@ -209,14 +220,18 @@ def second_order_bend(part: RingPart) -> list[Piece]:
 
     def one_slice(z, par, turn, sign):
         thickness = par["length"] / part.slices
+
+        def shine(z, i):
+            return emit(curved_kick, z, kicks[i] * thickness, par, part, sign, i, turn)
+
         # Not a flow: two of these drifts are not one, and the inverse is solved for.
         for i in range(len(coasts))[::sign]:
             if sign < 0 and i < len(kicks):
-                z = _second_order_kick(z, -kicks[i] * thickness, par, order)
+                z = shine(_second_order_kick(z, -kicks[i] * thickness, par, order), i)
             coast = near_identity(lambda z, par, c=coasts[i]: _curved_drift(z, c * thickness, par))
             z = coast.apply(z, par, turn, sign)
             if sign > 0 and i < len(kicks):
-                z = _second_order_kick(z, kicks[i] * thickness, par, order)
+                z = _second_order_kick(shine(z, i), kicks[i] * thickness, par, order)
         return z
 
     return [Piece(one_slice, part.slices)]

@@ -60,10 +60,12 @@ def forward(pieces: Pieces, z: Particle, par: Parameters, turn: Any, sign: int) 
     """The map of a part of an element, or its inverse for sign −1."""
     for piece in pieces[::sign]:
 
-        def step(z, _, piece=piece):
-            return piece.apply(z, par, turn, sign), None
+        def step(z, number, piece=piece):
+            values = {**par, "slice": number} if "key" in par else par
+            return piece.apply(z, values, turn, sign), None
 
-        z, _ = step(z, None) if piece.times == 1 else lax.scan(step, z, None, piece.times)
+        numbers = jnp.arange(piece.times) if "key" in par else None
+        z, _ = step(z, 0) if piece.times == 1 else lax.scan(step, z, numbers, piece.times)
     return z
 
 
@@ -114,9 +116,9 @@ KICKS = {2: (1.0,), 4: (_FR, 1 - 2 * _FR, _FR), 6: (*_Y, 1 - 2 * sum(_Y), *rever
 
 
 def drifts_and_kicks(coast: Callable, kick: Callable, part: RingPart) -> list[Piece]:
-    """``coast(z, length, par)`` and ``kick(z, length, par, order)`` by turns in each slice. The two
-    coasts between slices are one; half a coast before the first slice and after the last completes
-    them."""
+    """``coast(z, length, par)`` and ``kick(z, length, par, part, sign, number, turn)`` by turns in
+    each slice. The two coasts between slices are one; half a coast before the first slice and after
+    the last completes them."""
     kicks = KICKS[part.scheme]
     coasts = [(a + b) / 2 for a, b in zip(kicks, (*kicks[1:], kicks[0]), strict=True)]
 
@@ -125,10 +127,13 @@ def drifts_and_kicks(coast: Callable, kick: Callable, part: RingPart) -> list[Pi
         return Piece(lambda z, par, turn, sign: coast(z, sign * c * par["length"], par))
 
     def one_slice(z, par, turn, sign):
-        moves = [m for k, d in zip(kicks, coasts, strict=True) for m in ((True, k), (False, d))]
-        for is_kick, c in moves[::sign]:
-            length = sign * c / part.slices * par["length"]
-            z = kick(z, length, par, part.order) if is_kick else coast(z, length, par)
+        for i in range(2 * len(kicks))[::sign]:
+            c = (coasts if i % 2 else kicks)[i // 2]
+            length = c / part.slices * par["length"]
+            if i % 2:
+                z = coast(z, sign * length, par)
+            else:
+                z = kick(z, length, par, part, sign, i // 2, turn)
         return z
 
     return [end(kicks[0] / 2), Piece(one_slice, part.slices), end(-kicks[0] / 2)]
@@ -207,6 +212,12 @@ def quadrupole_fringe(side: int) -> Piece:
 
 def thin_kick(z: Particle, par: Parameters, sign: int, order: int) -> Particle:
     return kick(z, sign, par, order)
+
+
+def rescaled(z: Particle, scale: Any, sign: int) -> Particle:
+    """Momenta relative to `scale` times the reference momentum, or back for sign −1."""
+    factor = 1 / scale if sign > 0 else scale
+    return z._replace(px=factor * z.px, py=factor * z.py, delta=z.delta * factor + (factor - 1))
 
 
 def lens(z: Particle, par: Parameters, sign: int, potential: Callable) -> Particle:

@@ -168,10 +168,10 @@ def _analyse(ring: Ring, dp: Any, guess: Any, epsilon: Any, chromatic: bool, sta
 
 
 def four(ring: Ring) -> Ring:
-    """The ring with its cavities off."""
+    """The ring with its cavities and its radiation off."""
     columns = dict(ring.columns)
-    if "voltage" in columns:
-        columns["voltage"] = jax.device_put(np.zeros(np.shape(columns["voltage"])))
+    for name in {"voltage", "loss"} & columns.keys():
+        columns[name] = jax.device_put(np.zeros(np.shape(columns[name])))
     return eqx.tree_at(lambda other: other.columns, ring, columns)
 
 
@@ -189,11 +189,15 @@ def map_of(kinds: tuple[RingPart, ...]) -> Callable:
             def kick(z, step):
                 # The kick and its own drift, then half of the difference to the next one's.
                 for piece, share in ((pieces[1], step[0]), (pieces[0], step[1] - step[0])):
-                    z = piece.apply(z, {**par, "length": share * par["length"]}, 0, 1)
+                    values = {"noise": step[2:]} if "noise" in par else {}
+                    values = {**values, "length": share * par["length"]}
+                    z = piece.apply(z, {**par, **values}, 0, 1)
                 return z, None
 
             if kind.name in SLICED_PARTS:
-                return lambda z: lax.scan(kick, z, jnp.stack([steps[:-1], steps[1:]], 1))[0]
+                noises = [par["noise"][: len(steps) - 1]] if "noise" in par else []
+                rows = jnp.stack([steps[:-1], steps[1:], *noises], 1)
+                return lambda z: lax.scan(kick, z, rows)[0]
             return lambda z: forward(pieces, z, share, 0, 1)
 
         return lax.switch(part, [*map(kind_map, kinds), lambda z: z], z)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from . import _curved as curved, _exact as exact, _frames as frames, _maps as maps
 from ._maps import Parameters, Piece, RingPart
+from ._radiation import radiant, wedge
 
 
 def _flow(move: Callable) -> list[Piece]:
@@ -47,7 +48,7 @@ def _wedge(side: str, end: int, order: int) -> list[Piece]:
     def kick(z, par, turn, sign):
         return exact.wedge_kick(z, -sign * jnp.tan(par[f"edge_{side}"]), par, order)
 
-    return [_turn(side, exact.wedge, -end), Piece(kick)][::end]
+    return [_turn(side, exact.wedge, -end), Piece(kick), wedge(side)][::end]
 
 
 Make = Callable[[RingPart], list[Piece]]
@@ -56,7 +57,7 @@ Make = Callable[[RingPart], list[Piece]]
 def _ends(side: str, sign: int) -> dict[str, Make]:
     """The parts at the entrance of an element, "in" and 1, or at its exit, "out" and −1."""
     return {
-        f"edge_{side}": lambda p: [maps.edge(side, True, p.scheme)],
+        f"edge_{side}": lambda p: [maps.edge(side, True, p.scheme), wedge(side)][::sign],
         f"at_edge_{side}": lambda p: [maps.edge(side, False, p.scheme)],
         f"second_order_edge_{side}": lambda p: [exact.second_order_edge(side, sign)],
         f"fringe_{side}": lambda p: [maps.quadrupole_fringe(sign)],
@@ -82,6 +83,9 @@ def _ends(side: str, sign: int) -> dict[str, Make]:
             lambda z, par, direction: frames.moved(z, par, (1 - sign) / 2, sign * direction)
         ),
         f"affine_{side}": lambda p: [maps.affine(side)],
+        f"scaled_{side}": lambda p: _plain(
+            lambda z, par, direction: maps.rescaled(z, par["scale"], sign * direction)
+        ),
     }
 
 
@@ -89,11 +93,11 @@ _MAPS: dict[str, Make] = {
     "drift": lambda p: _flow(maps.drift),
     "half_drift": lambda p: _flow(lambda z, length, par: maps.drift(z, length / 2, par)),
     "exact_drift": lambda p: _flow(exact.exact_drift),
-    "straight": lambda p: maps.drifts_and_kicks(maps.drift, maps.kick, p),
-    "bend": lambda p: maps.drifts_and_kicks(maps.drift, maps.curved_kick, p),
-    "exact_straight": lambda p: maps.drifts_and_kicks(exact.exact_drift, maps.kick, p),
-    "exact_bend": lambda p: maps.drifts_and_kicks(exact.exact_bend, curved.curved_kick, p),
-    "at_exact_bend": lambda p: maps.drifts_and_kicks(exact.exact_bend, maps.kick, p),
+    "straight": lambda p: maps.drifts_and_kicks(maps.drift, radiant(maps.kick), p),
+    "bend": lambda p: maps.drifts_and_kicks(maps.drift, radiant(maps.curved_kick), p),
+    "exact_straight": lambda p: maps.drifts_and_kicks(exact.exact_drift, radiant(maps.kick), p),
+    "exact_bend": lambda p: maps.drifts_and_kicks(exact.exact_bend, radiant(curved.curved_kick), p),
+    "at_exact_bend": lambda p: maps.drifts_and_kicks(exact.exact_bend, radiant(maps.kick), p),
     "second_order_bend": exact.second_order_bend,
     "thin": lambda p: _plain(functools.partial(maps.thin_kick, order=p.order)),
     "lens": lambda p: _plain(functools.partial(maps.lens, potential=p.potential)),  # pyright: ignore[reportArgumentType]

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ...base.checks import instance, one_of
+from lanewise.jaxprs.jaxapi import is_traced
+
+from ...base.checks import in_range, instance, one_of
 from ...base.results import RESULTS
 from ...methods import Method
 from ...methods.step import judge, no_solve
@@ -204,6 +206,9 @@ def problem(ring: Ring, planes: Planes = "xyz", delta: Any = 0.0) -> RingProblem
     """
     instance("ring", ring, Ring, "a rings.Ring")
     one_of("planes", planes, ("x", "xy", "xyz"))
+    if not is_traced(loss := ring.columns.get("loss", jnp.zeros(1))):
+        hint = "A system has a symplectic map: use rings.radiating(ring, None)."
+        in_range("loss of the magnets", loss, 0.0, 0.0, hint)
     passage = jax.tree.map(jnp.asarray, Passage.from_ring(ring))
     args = RingArgs(passage, jnp.asarray(delta, float))
     perturbation = _PlaceHamiltonian(is_slope=True) if ring.extra else None

@@ -14,6 +14,7 @@ from ...base.keywords import user_level
 from ._elements import C, Element, Model, bend, cavity, corrector, drift, multipole, solenoid
 from ._files import check_source, read_lattice
 from ._maps import RingPart
+from ._radiation import ELECTRON, constants
 from ._ring import Ring
 
 # Our (x, px, y, py, ζ, δ) is _ORDER @ (x, px, y, py, δ, ct) of pyAT.
@@ -33,19 +34,24 @@ _WITHOUT_EFFECT = {
 }
 _BARE = ("RFCavityPass", "CavityPass", "AperturePass", "Matrix66Pass")
 """Pass methods without apertures; only that of a matrix may be misaligned."""
+_RADIATING = (
+    "StrMPoleSymplectic4RadPass", "BndMPoleSymplectic4RadPass", "ExactMultipoleRadPass",
+    "ExactSectorBendRadPass",
+)  # fmt: skip
 _AT_PARTS = ("exact_bend", "wedge_in", "wedge_out")
 """Parts of exact bends that are others in pyAT: with the field of straight multipoles in the body,
 and without multipoles in the wedges."""
 
 
 class Settings(NamedTuple):
-    """What all elements of a lattice need: energy [eV], period [s], name of the edges of bends, and
-    the model, or None for that of the pass method."""
+    """What all elements of a lattice need: energy [eV], period [s], name of the edges of bends, the
+    model, or None for that of the pass method, and the rest energy of the particle [eV]."""
 
     energy: float
     period: float
     edge: str
     model: Model | None
+    mass: float
 
     def is_exact(self, source: Any) -> bool:
         return self.model == "exact" or (not self.model and source.PassMethod.startswith("Exact"))
@@ -113,7 +119,8 @@ def from_at(lattice: Any, *, symplectic: bool = False, model: Model | None = Non
     edges with a fringe field depend on δ without the change of ζ that belongs to it; with
     ``symplectic=True`` it is added. `model`: "exact" or "paraxial" for all drifts, multipoles and
     bends, whatever their pass method is; "exact" has multipoles of bends in curved coordinates, see
-    `bend`. Radiation and collective effects are not supported.
+    `bend`. Magnets with a pass method that ends with RadPass radiate. Collective effects are not
+    supported.
 
     **Raises** `ValueError` with the first ten elements, with name and number, that have no
     counterpart here or that pyAT has replaced by a drift or marker.
@@ -126,7 +133,8 @@ def from_at(lattice: Any, *, symplectic: bool = False, model: Model | None = Non
     rest_energy = getattr(particle, "rest_energy", 0.0) or 0.0
     gamma = lattice.energy / rest_energy if rest_energy else math.inf
     period = lattice.get_s_pos(len(lattice))[0] / (C * math.sqrt(1 - 1 / gamma**2))
-    settings = Settings(lattice.energy, period, "edge" if symplectic else "at_edge", model)
+    edge, mass = "edge" if symplectic else "at_edge", rest_energy or ELECTRON
+    settings = Settings(lattice.energy, period, edge, model, mass)
     elements = []
     for i, source in enumerate(lattice):
         try:
@@ -154,13 +162,17 @@ def _element(source: Any, settings: Settings) -> Element:
         value = getattr(source, name, neutral[0])
         if value not in neutral:
             raise ValueError(f"{name} = {value} is not supported")
-    make = _MAKERS.get(source.PassMethod)
+    radiates = source.PassMethod in _RADIATING
+    make = _MAKERS.get(source.PassMethod.replace("Rad", "") if radiates else source.PassMethod)
     if make is None:
         remedy = "; to switch it off: lattice.enable_6d(dipole_pass=None, quadrupole_pass=None)"
         radiates = any(name in source.PassMethod for name in ("Rad", "Quant"))
         message = f"radiation is not supported{remedy}" if radiates else "its map is not supported"
         raise ValueError(message)
     element = make(source, settings)
+    if radiates:
+        values = {**element.values, **constants(settings.energy, settings.mass)}
+        element = dataclasses.replace(element, values=values)
     if source.PassMethod in _BARE:
         return element
     rectangle, ellipse = (getattr(source, f"{k}Apertures", None) for k in "RE")

@@ -20,6 +20,7 @@ from ...base.machine import results_memory
 from ...base.printing import printable
 from ...integration.reconstruction import fold_blocks
 from ._maps import Particle
+from ._quantum import fly_with_noise
 from ._ring import Ring
 from ._turn import Passage, coordinates, start
 
@@ -53,13 +54,16 @@ def track(
     every: int | None = None,
     epsilon: Any = 0.0,
     first_turn: int = 0,
+    key: Any = None,
 ) -> Tracked:
     r"""Particles over `turns` turns, all of a batch at once.
 
     **Arguments** `z`: (x, px, y, py, ζ, δ), shape (…, 6): x, y [m], momenta over that of the
     reference particle, ζ = −c Δt [m] (late particles have ζ < 0), δ = Δp/p. `every`: save after
     each m-th turn, a divisor of `turns`; None: after the last one. `epsilon`: factor of what
-    `Ring.perturbed` set aside. `first_turn`: number of the first turn, for cavities with a slip.
+    `Ring.perturbed` set aside. `first_turn`: number of the first turn, for cavities with a slip
+    and for the noise. `key`: for the quantum excitation of a ring that radiates, an integer or a
+    key of jax.random; None: without.
 
     A particle is lost at an aperture, or where |x|, |px|, |y|, |py| or |δ| exceeds 1.
 
@@ -99,7 +103,8 @@ def track(
     shape = z.shape[:-1]
     epsilon = jnp.broadcast_to(jnp.asarray(epsilon, float), shape).reshape(-1)
     counts = turns // every, every, first_turn
-    states, turn, element, last = _track(ring, z.reshape(-1, 6), epsilon, counts)
+    fly = _track if key is None else functools.partial(fly_with_noise, key=key)
+    states, turn, element, last = fly(ring, z.reshape(-1, 6), epsilon, counts)
     states = states[:, -1] if turns == every else states
     parts = states, turn, element, last
     return Tracked(*(x.reshape(*shape, *x.shape[1:]) for x in parts))

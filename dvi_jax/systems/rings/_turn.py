@@ -131,12 +131,14 @@ class Passage(eqx.Module):
     - `rows`: the parameters b of each part at ε = 0. `slopes`: their derivatives b' by ε, of the
       parameters that depend on it; see `parameters_at`.
     - `numbers`: of each part in `parts`, and of its element; whether the element ends there.
+    - `key`: two words for the quantum noise of `fly`; None: without noise.
     """
 
     rows: Rows
     slopes: Rows
     numbers: Rows
     parts: tuple[RingPart, ...] = eqx.field(static=True)
+    key: Array | None = None
 
     @classmethod
     def from_ring(cls, ring: Ring) -> "Passage":
@@ -174,6 +176,7 @@ class Passage(eqx.Module):
         def row(flight, columns):
             number, values, slopes = columns
             par = parameters_at(values, slopes, epsilon)
+            par = par if self.key is None else {**par, "key": self.key}
 
             def part_map(part):
                 is_inside = APERTURES.get(part.name)
