@@ -15,6 +15,7 @@ from ._elements import (
     sextupole as sextupole,
     solenoid as solenoid,
 )
+from ._losses import beam_pipe as beam_pipe
 from ._nonlinear import (
     FrequencyMap as FrequencyMap,
     detuning as detuning,

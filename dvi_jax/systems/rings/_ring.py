@@ -23,7 +23,7 @@ from ._maps import RingPart, distinct
 Where = str | int | Sequence[int]
 
 
-_READERS = {
+READERS = {
     "length": (
         "drift", "half_drift", "exact_drift", "corrector", "solenoid", "straight", "exact_straight",
         "bend", "exact_bend", "at_exact_bend", "second_order_bend",
@@ -141,6 +141,20 @@ class Ring(eqx.Module):
         return len(self.names)
 
     @property
+    def elements(self) -> tuple[Element, ...]:
+        """The elements with their parameters, at ε = 0, to make other rings of them: for example
+        ``rings.Ring(ring.elements[5:] + ring.elements[:5])`` begins with element 5."""
+        table = {k: x if is_traced(x) else np.asarray(x) for k, x in self.columns.items()}
+        parts: list[list[RingPart]] = [[] for _ in self.names]
+        for part, i in self.program.rows:
+            parts[i].append(self.program.parts[part])
+        rows = zip(self.names, self.kinds, parts, self.program.parameters, strict=True)
+        return tuple(
+            Element(name, kind, tuple(own), {k: table[k][i] for k in table if k in keys})
+            for i, (name, kind, own, keys) in enumerate(rows)
+        )
+
+    @property
     def places(self) -> Array:
         """s at the entrance of each element and at the end [m], shape (elements + 1,)."""
         return jnp.concatenate([jnp.zeros(1), jnp.cumsum(self.columns["length"])])
@@ -198,7 +212,7 @@ class Ring(eqx.Module):
 
     def _numbers(self, selection: Where, parameter: str, changes: bool = False) -> np.ndarray:
         numbers = self.where(selection)
-        readers = _READERS.get(parameter) if changes else None
+        readers = READERS.get(parameter) if changes else None
         if readers:
             part, element = np.asarray(self.program.rows).T
             reads = element[[self.program.parts[i].name in readers for i in part]]
