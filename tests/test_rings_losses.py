@@ -140,7 +140,7 @@ def test_correctors_cavities_and_later_turns():
     assert place_of(cavity, px=0.0085)[0] == pytest.approx(1 + 0.0015 / 0.0085 * 1.5, abs=1e-9)
     assert place_of(cavity, px=0.0125)[0] == pytest.approx(0.8, abs=1e-9)
     ring = rings.Ring([D, rings.multipole("K", 0.0, (0.0, 0.1)), D.inside(**BOX)])
-    z = np.array([[0.0, 0.002, 0, 0, 0, 0], [0.0, 1e-4, 0, 0, 0, 0]])
+    z = np.array([[0.0, 0.0018, 0, 0, 0, 0], [0.0, 1e-4, 0, 0, 0, 0]])
     out = rings.track(ring, z[None], 2)
     s = np.asarray(out.places(ring))
     assert s.shape == (1, 2)

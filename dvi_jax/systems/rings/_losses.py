@@ -27,7 +27,7 @@ _EDGE = 1e-9
 Parts = tuple[RingPart, ...]
 
 
-def within(part: RingPart, z: Particle, par: Parameters, turn: Any, share: Any) -> Particle:
+def partial_map(part: RingPart, z: Particle, par: Parameters, turn: Any, share: Any) -> Particle:
     """The particle after a share of the length of a thick part."""
     shares = {key: share * par[key] for key in ("length", "kick_x", "kick_y") if key in par}
     return forward(pieces_of(part), z, {**par, **shares}, turn, 1)
@@ -74,25 +74,27 @@ def _shares(parts: Parts, end: int, table: Any, last: Array, turn: Array) -> Arr
     """The shares of an element before the losses behind part number `end`."""
     thick, count = spans(parts), _SAMPLES + _BISECTIONS
     first = next(iter(thick))
-    between = [i for i in range(first, end + 1) if parts[i].name not in APERTURES]
+    order = [i for i in range(first, end + 1) if parts[i].name not in APERTURES]
 
     def share_of(par, last, turn):
         z = Particle(*last)
-        for i in reversed(between):
+        for i in reversed(order):
             z = forward(pieces_of(parts[i]), z, par, turn, -1)
         total, is_found = 0.0, jnp.asarray(False)
-        for i in between:
+        for i in order:
             if i not in thick:
                 z = forward(pieces_of(parts[i]), z, par, turn, 1)
                 continue
             begin, size = thick[i]
 
-            def search(k, state, i=i, begin=begin, size=size, entrance=z):
+            def search(
+                k: Array, state: tuple, i=i, begin=begin, size=size, entrance=z
+            ) -> tuple[Any, ...]:
                 # First along the part, then by bisection, and the end at last: one program.
                 low, high, is_out, _ = state
                 share = jnp.where(is_out, (low + high) / 2, jnp.minimum(k / _SAMPLES, 1.0))
                 share = jnp.where(k == count, 1.0, share)
-                z = within(parts[i], entrance, par, turn, share)
+                z = partial_map(parts[i], entrance, par, turn, share)
                 is_in = _is_inside(parts[i + 1 :], z, par, begin + size * share)
                 is_last = k == count
                 low = jnp.where(is_in & ~is_last, share, low)
@@ -178,7 +180,7 @@ def beam_pipe(ring: Ring, s: Any, *, ellipse: Any = None, rectangle: Any = None)
             columns |= pair
             owner = np.clip(np.searchsorted(places, s, side="right") - 1, 0, len(ring) - 1)
             share = (s - places[owner]) / np.maximum(np.diff(places)[owner], _EDGE)
-            begin, end = (values[owner] for values in pair.values())
+            begin, end = (x[owner] for x in pair.values())
             excess = (1 - share) * begin + share * end - column
             excess = -excess if key.endswith("_min") else excess
             narrow = (share > 1e-6) & (share < 1 - 1e-6) & (excess > 1e-6)
@@ -194,7 +196,7 @@ def beam_pipe(ring: Ring, s: Any, *, ellipse: Any = None, rectangle: Any = None)
     elements = []
     for i, element in enumerate(ring.elements):
         for first, last, keys in parts:
-            own = {f"{k}_{end}": columns[f"{k}_{end}"][i] for k in keys for end in ("in", "out")}
-            element = element.within(first, last, **own)
+            values = {f"{k}_{end}": columns[f"{k}_{end}"][i] for k in keys for end in ("in", "out")}
+            element = element.within(first, last, **values)
         elements.append(element)
     return Ring(elements, ring.energy, ring.periods)
