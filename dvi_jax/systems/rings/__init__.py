@@ -1,5 +1,6 @@
 """Storage rings: lattices of magnets as maps, with gradients and invariants."""
 
+from ._beams import beam_beam as beam_beam, space_charge as space_charge
 from ._elements import (
     Element as Element,
     aperture as aperture,
@@ -15,6 +16,7 @@ from ._elements import (
     sextupole as sextupole,
     solenoid as solenoid,
 )
+from ._feeddown import feed_down as feed_down
 from ._losses import beam_pipe as beam_pipe
 from ._nonlinear import (
     FrequencyMap as FrequencyMap,
@@ -34,4 +36,5 @@ from ._optics import (
 from ._problem import Turn as Turn, problem as problem
 from ._readers import from_at as from_at, load as load
 from ._ring import Ring as Ring
+from ._save import save as save
 from ._track import Tracked as Tracked, track as track

@@ -94,15 +94,16 @@ def _shares(parts: Parts, end: int, table: Any, last: Array, turn: Array) -> Arr
                 low, high, is_out, _ = state
                 share = jnp.where(is_out, (low + high) / 2, jnp.minimum(k / _SAMPLES, 1.0))
                 share = jnp.where(k == count, 1.0, share)
-                z = partial_map(parts[i], entrance, par, turn, share)
-                is_in = _is_inside(parts[i + 1 :], z, par, begin + size * share)
+                point = partial_map(parts[i], entrance, par, turn, share)
+                is_in = _is_inside(parts[i + 1 :], point, par, begin + size * share)
                 is_last = k == count
                 low = jnp.where(is_in & ~is_last, share, low)
                 high = jnp.where(is_in | is_last, high, share)
-                return low, high, is_out | (~is_in & ~is_last), z
+                return low, high, is_out | (~is_in & ~is_last), point
 
             start = jnp.zeros(()), jnp.ones(()), jnp.asarray(False), z
-            _, high, is_out, z = lax.fori_loop(0, count + 1, search, start)
+            _, high, is_out, exit_state = lax.fori_loop(0, count + 1, search, start)
+            z = Particle(*exit_state)
             total = jnp.where(is_found, total, begin + size * high)
             is_found |= is_out
         distance = jnp.max(jnp.abs(jnp.stack(z) - last))

@@ -303,7 +303,7 @@ def analysis(
     return twiss, size
 
 
-_FRAMES: dict[str, Callable] = {
+FRAMES: dict[str, Callable] = {
     "placed": lambda c: c["roll"],
     "moved": lambda c: c["roll"],
     "tilted": lambda c: c["tilt"],
@@ -318,7 +318,7 @@ def _upright(ring: Ring, pieces: np.ndarray, v: Array) -> Array:
     part, element = np.asarray(ring.program.rows).T
     names = np.asarray([p.name for p in ring.program.parts])[part]
     angle = jnp.zeros(len(names))
-    for frame, turn in _FRAMES.items():
+    for frame, turn in FRAMES.items():
         last = names == f"{frame}_out"
         # A matrix in the place of a magnet has no affine map at its end.
         first = (names == f"{frame}_in") & np.isin(element, element[last])

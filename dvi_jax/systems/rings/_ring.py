@@ -103,6 +103,7 @@ class Ring(eqx.Module):
         values = [x for element in elements for x in element.values.values()]
         xp = jnp if any(map(is_traced, values)) else np
         names = {name: np.shape(x) for element in elements for name, x in element.values.items()}
+        names.setdefault("length", ())
         columns = {
             name: xp.stack([xp.asarray(element.values.get(name, np.zeros(shape)), float)
                             for element in elements])
