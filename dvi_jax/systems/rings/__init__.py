@@ -33,6 +33,7 @@ from ._optics import (
     one_turn as one_turn,
     optics as optics,
 )
+from ._peers import from_latticejson as from_latticejson, from_madx as from_madx
 from ._problem import Turn as Turn, problem as problem
 from ._readers import from_at as from_at, load as load
 from ._ring import Ring as Ring

@@ -96,6 +96,8 @@ def read_lattice(path: Path, use: str | None, options: dict[str, Any]) -> Any:
             raise
         names = [*_PARSERS, ".mat", ".m", ".repr", ".json", ".lat"]
         message = f"path must end with one of {names}, got {path.name!r}."
+        if suffix == ".bmad":
+            message += " Bmad's program bmad_to_mad_sad_elegant writes files of MAD-X."
         raise ValueError(message) from None
     except (TypeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path.name} cannot be read: {error}") from error
