@@ -61,6 +61,9 @@ def test_what_madx_has_and_rings_have_not(madx):
         rings.from_madx(madx.sequence.r)
     assert "crabcavity is not supported" in str(error.value)
     assert "KNL[0], KSL[0] or ANGLE bend" in str(error.value)
+    madx.input('select,flag=error,pattern="^m$"; efcomp,order=1,dkn={0,1e-3};')
+    with pytest.raises(ValueError, match="errors of EFCOMP are not supported"):
+        rings.from_madx(madx.sequence.r)
     madx.input("beam,particle=proton,energy=2.0; use,sequence=r;")
     with (
         pytest.warns(UserWarning, match="the beam of MAD-X has v = 0.88"),

@@ -35,9 +35,8 @@ _LATTICE_JSON = {
 def from_madx(sequence: Any, *, model: Model = "exact") -> Ring:
     """The ring of a sequence of MAD-X that runs in cpymad, after all commands that change it.
 
-    With apertures (circle, ellipse, rectangle, rectellipse, rectcircle), tilts, errors of EALIGN
-    and EFCOMP, K0 that is not ANGLE/L, and cavities with their LAG. The reference particle has
-    v = c here.
+    With apertures (circle, ellipse, rectangle, rectellipse, rectcircle), tilts, errors of EALIGN,
+    K0 that is not ANGLE/L, and cavities with their LAG. The reference particle has v = c here.
 
     **Arguments** `sequence`: such as ``Madx().sequence.ring`` after USE; it is expanded. `model`:
     see `multipole`. **Raises** `ValueError` with the elements that have no counterpart.
@@ -62,6 +61,9 @@ def from_madx(sequence: Any, *, model: Model = "exact") -> Ring:
 
 def _of_madx(source: Any, beam: Any, model: Model) -> Element:
     kind, values = source.base_type.name, dict(source)
+    field = getattr(source, "field_errors", None)
+    if field is not None and any(np.any(getattr(field, name)) for name in ("dkn", "dks")):
+        refuse("errors of EFCOMP are not supported")
     element = _plain(source.name, kind, source.length, values, 1e9 * beam.energy, beam.freq0, model)
     for name in ("h1", "h2", "ktap", "lagf", "dfreq"):
         if values.get(name):
