@@ -439,21 +439,31 @@ def test_the_symplectic_edge_is(at):
 
 
 def test_files_of_xsuite(at, tmp_path):
-    """Written by pyAT; an element that pyAT does not know is refused, with its place."""
+    """Written by pyAT, with the cavities on; an aperture is read, and an element that pyAT does not
+    know is refused, with its place."""
     lattice = lattice_of(at, "hmba.mat")
     path = tmp_path / "ring.json"
     at.save_xsuite(lattice, str(path))
     z = particles(5) * 0.1
-    with pytest.warns(UserWarning, match="pyAT switches off the cavities of this file"):
-        ring = rings.load(path)
+    ring = rings.load(path)
     with pytest.raises(FileNotFoundError, match="there is no file"):
         rings.load(tmp_path / "missing.mat")
-    np.testing.assert_array_equal(rings.track(ring, z).z, rings.track(rings.from_at(lattice), z).z)
+    lattice.enable_6d(dipole_pass=None, quadrupole_pass=None)
+    for e in lattice:
+        e.PassMethod = {"RFCavityPass": "CavityPass"}.get(e.PassMethod, e.PassMethod)
+        if isinstance(e, at.Dipole):  # pyAT writes "linear", which has no fringe field
+            e.FringeQuadEntrance = e.FringeQuadExit = 0
+    wanted = rings.track(rings.from_at(lattice), z).z
+    np.testing.assert_allclose(rings.track(ring, z).z, wanted, rtol=0, atol=1e-15)
+    assert np.abs(np.asarray(wanted)[:, 5] - z[:, 5]).max() > 1e-8
     content = json.loads(path.read_text())
-    content["elements"]["limit"] = {"__class__": "LimitEllipse", "a": 0.01, "b": 0.01}
+    content["elements"]["limit"] = {"__class__": "LimitEllipse", "a": 0.01, "b": 0.02}
     content["element_names"].insert(5, "limit")
     path.write_text(json.dumps(content))
-    message = r"5: limit \(Marker, IdentityPass\): pyAT has no element for LimitEllipse"
+    assert rings.load(path).get("limit", "radius_y").tolist() == [0.02]
+    content["elements"]["limit"] = {"__class__": "Wire", "current": 1.0}
+    path.write_text(json.dumps(content))
+    message = r"5: limit \(Marker, IdentityPass\): pyAT has no element for Wire"
     with warnings.catch_warnings(action="ignore"), pytest.raises(ValueError, match=message):
         rings.load(path)
 

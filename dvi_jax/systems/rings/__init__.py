@@ -1,5 +1,6 @@
 """Storage rings: lattices of magnets as maps, with gradients and invariants."""
 
+from ._beams import beam_beam as beam_beam, space_charge as space_charge
 from ._damping import (
     in_phase as in_phase,
     radiating as radiating,
@@ -22,6 +23,8 @@ from ._elements import (
     solenoid as solenoid,
 )
 from ._envelope import Equilibrium as Equilibrium, equilibrium as equilibrium
+from ._feeddown import feed_down as feed_down
+from ._losses import beam_pipe as beam_pipe
 from ._nonlinear import (
     FrequencyMap as FrequencyMap,
     detuning as detuning,
@@ -37,8 +40,10 @@ from ._optics import (
     one_turn as one_turn,
     optics as optics,
 )
+from ._peers import from_latticejson as from_latticejson, from_madx as from_madx
 from ._problem import Turn as Turn, problem as problem
 from ._readers import from_at as from_at, load as load
 from ._ring import Ring as Ring
+from ._save import save as save
 from ._touschek import touschek_lifetime as touschek_lifetime
 from ._track import Tracked as Tracked, track as track

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...base.keywords import user_level
+from ._xsuite import fold_limits, replaced
 
 _PARSERS = {
     ".seq": "MadxParser", ".madx": "MadxParser", ".mad8": "Mad8Parser", ".lte": "ElegantParser",
@@ -95,6 +96,8 @@ def read_lattice(path: Path, use: str | None, options: dict[str, Any]) -> Any:
             raise
         names = [*_PARSERS, ".mat", ".m", ".repr", ".json", ".lat"]
         message = f"path must end with one of {names}, got {path.name!r}."
+        if suffix == ".bmad":
+            message += " Bmad's program bmad_to_mad_sad_elegant writes files of MAD-X."
         raise ValueError(message) from None
     except (TypeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path.name} cannot be read: {error}") from error
@@ -218,6 +221,7 @@ def _of_elegant(kind: type) -> type:
 
 
 def _of_xsuite(data: dict[str, Any], path: Path, use: str | None, options: dict[str, Any]) -> Any:
+    import at
     from at.load.xsuite import XsLine
 
     if "lines" in data:
@@ -225,12 +229,23 @@ def _of_xsuite(data: dict[str, Any], path: Path, use: str | None, options: dict[
     with contextlib.redirect_stdout(io.StringIO()):  # pyAT prints what it does not know
         line = XsLine.from_dict(data, use=use)
     unread = {name: _unread_of_xsuite(element) for name, element in line.elements.items()}
-    lattice = line.to_at(**options)
+    more = data.get("metadata", {})  # of `save`: what a line of Xsuite does not have
+    options = {"periodicity": more.get("periodicity", 1), **options}
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", message=".*unknown class (Limit(Rect|Ellipse)|UniformSolenoid) "
+        )
+        lattice = line.to_at(**options)
     for element in lattice:
         element.unread = unread.get(element.FamName, {})
         gap = line.elements.get(element.FamName, {}).get("edge_entry_hgap")
         if gap is not None:
             element.FullGap = 2 * gap  # pyAT 0.9.0 takes the half gap for the gap
+    contents = [line.elements[name] for name in line.element_names]
+    elements = [replaced(*pair, at) for pair in zip(lattice, contents, strict=True)]
+    lattice[:] = fold_limits(line.element_names, elements)
+    for element, name in zip(lattice, more.get("names", ()), strict=False):
+        element.FamName = name
     return lattice
 
 

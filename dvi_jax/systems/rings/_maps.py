@@ -1,5 +1,6 @@
 """Maps of the parts of an element: drifts, kicks, edges, cavities, and their inverses."""
 
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -270,8 +271,26 @@ def inside_ellipse(z: Particle, par: Parameters) -> Any:
     return (z.x / par["radius_x"]) ** 2 + (z.y / par["radius_y"]) ** 2 <= 1
 
 
+LIMITS = {
+    "rectangle": ("x_min", "x_max", "y_min", "y_max"),
+    "ellipse": ("radius_x", "radius_y"),
+}
+"""The parameters of each kind of aperture."""
+
+
+def inside_pipe(kind: str, share: Any, z: Particle, par: Parameters) -> Any:
+    """The same in a pipe whose limits change linearly along the element, at a share of it."""
+    limits = {k: (1 - share) * par[f"{k}_in"] + share * par[f"{k}_out"] for k in LIMITS[kind]}
+    return APERTURES[kind](z, limits)
+
+
 APERTURES: dict[str, Callable[[Particle, Parameters], Any]] = {
     "rectangle": inside_rectangle,
     "ellipse": inside_ellipse,
+    **{
+        f"{kind}_{end}": functools.partial(inside_pipe, kind, share)
+        for kind in LIMITS
+        for end, share in (("in", 0.0), ("out", 1.0))
+    },
 }
 """Parts that do not move a particle: whether it passes."""

@@ -100,10 +100,10 @@ def resonance_driving_terms(
     for name in terms:
         if len(name) != 6 or name[0] != "h" or not name[1:].isdigit():
             raise ValueError(f"terms must be names such as 'h21000', got {name!r}.")
-    if any(part.name == "lens" for part in ring.program.parts):
+    if any(part.name in ("lens", "beam", "beam_slices") for part in ring.program.parts):
         raise ValueError(
-            "the ring must not contain a lens, whose potential is not in the driving terms: use "
-            "rings.multipole with length 0 where it is a polynomial."
+            "the ring must not contain a lens or the field of a beam, whose potentials are not in "
+            "the driving terms: use rings.multipole with length 0 where it is a polynomial."
         )
     optics(ring, dp, chromatic=False)
     o, _ = analysis(ring, real_numbers("dp", dp) * np.eye(6)[5], False, False, True)

@@ -343,7 +343,7 @@ def _solve(xp: Any, A: Any, b: Any) -> Any:
         return np.full(b.shape, np.nan)
 
 
-_FRAMES: dict[str, Callable] = {
+FRAMES: dict[str, Callable] = {
     "placed": lambda c: c["roll"],
     "moved": lambda c: c["roll"],
     "tilted": lambda c: c["tilt"],
@@ -358,7 +358,7 @@ def _upright(xp: Any, ring: Ring, pieces: np.ndarray, v: Any) -> Any:
     part, element = np.asarray(ring.program.rows).T
     names = np.asarray([p.name for p in ring.program.parts])[part]
     angle = np.zeros(len(names))
-    for frame, turn in _FRAMES.items():
+    for frame, turn in FRAMES.items():
         last = names == f"{frame}_out"
         # A matrix in the place of a magnet has no affine map at its end.
         first = (names == f"{frame}_in") & np.isin(element, element[last])

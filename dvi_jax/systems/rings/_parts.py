@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from . import _curved as curved, _exact as exact, _frames as frames, _maps as maps
+from . import _beams as beams, _curved as curved, _exact as exact, _frames as frames, _maps as maps
 from ._maps import Parameters, Piece, RingPart
 from ._radiation import radiant, wedge
 
@@ -101,6 +101,8 @@ _MAPS: dict[str, Make] = {
     "second_order_bend": exact.second_order_bend,
     "thin": lambda p: _plain(functools.partial(maps.thin_kick, order=p.order)),
     "lens": lambda p: _plain(functools.partial(maps.lens, potential=p.potential)),  # pyright: ignore[reportArgumentType]
+    "beam": lambda p: _plain(beams.beam_kick),
+    "beam_slices": lambda p: _plain(functools.partial(beams.beam_slices, count=p.slices)),
     "cavity": lambda p: [Piece(maps.cavity)],
     "corrector": lambda p: [Piece(maps.corrector)],
     "solenoid": lambda p: [Piece(frames.solenoid)],

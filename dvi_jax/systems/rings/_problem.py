@@ -72,7 +72,7 @@ class Turn(Method):
             return _state(ring.passage.image(z, turn, epsilon), q0, interval.h)
         flight = ring.passage.fly(start(z), turn, epsilon)
         q, p, info = _state(flight.z, q0, interval.h)
-        result = RESULTS.where(flight.element >= 0, RESULTS.lost, info.result)
+        result = RESULTS.where(flight.row >= 0, RESULTS.lost, info.result)
         return q, p, info._replace(result=result)
 
     def inverse(self, equations, interval, q1, p1):

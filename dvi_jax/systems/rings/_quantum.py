@@ -52,7 +52,7 @@ def _fly(ring: Ring, z: Array, epsilon: Array, words: Array, counts: tuple[int, 
 
         state = jnp.asarray(first, jnp.int32), start(Particle(*z))
         (_, flight), states = lax.scan(block, state, None, blocks)
-        return states, flight.turn, flight.element, jnp.stack(flight.last)
+        return states, flight.turn, flight.row, jnp.stack(flight.last)
 
     index = jnp.arange(len(z), dtype=jnp.uint32)
     keys = jnp.stack(threefry2x32(words, jnp.zeros_like(index), index), 1)

@@ -4,7 +4,8 @@ import dataclasses
 import math
 import os
 import warnings
-from typing import Any, NamedTuple, get_args
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, NoReturn, get_args
 
 import numpy as np
 
@@ -17,10 +18,10 @@ from ._maps import RingPart
 from ._radiation import ELECTRON, constants
 from ._ring import Ring
 
-# Our (x, px, y, py, ζ, δ) is _ORDER @ (x, px, y, py, δ, ct) of pyAT.
-_ORDER = np.zeros((6, 6))
-_ORDER[[0, 1, 2, 3, 5], [0, 1, 2, 3, 4]] = 1
-_ORDER[4, 5] = -1
+# Our (x, px, y, py, ζ, δ) is ORDER @ (x, px, y, py, δ, ct) of pyAT.
+ORDER = np.zeros((6, 6))
+ORDER[[0, 1, 2, 3, 5], [0, 1, 2, 3, 4]] = 1
+ORDER[4, 5] = -1
 
 # Attributes of an element that change its map and have no counterpart here, and values without
 # effect.
@@ -59,7 +60,7 @@ class Settings(NamedTuple):
 
 def to_at(z: Any) -> np.ndarray:
     """(x, px, y, py, δ, ct) as pyAT orders them, shape (6, …), from (x, px, y, py, ζ, δ)."""
-    return np.asfortranarray(np.moveaxis(np.asarray(z) @ _ORDER, -1, 0))
+    return np.asfortranarray(np.moveaxis(np.asarray(z) @ ORDER, -1, 0))
 
 
 def load(
@@ -83,7 +84,7 @@ def load(
     **Raises** `ValueError` for a file that cannot be read, and as `from_at`, also for attributes
     that pyAT leaves out, such as K0 of a bend that is not ANGLE/L.
     """
-    at = _accelerator_toolbox()
+    at = accelerator_toolbox()
     path = user_file("path", path)  # some of the readers of pyAT have no clear error
     lattice = read_lattice(path, use, options)
     cavities = [e.FamName for e in lattice if isinstance(e, at.RFCavity) and _is_off(e)]
@@ -98,7 +99,7 @@ def load(
     return from_at(lattice, symplectic=symplectic, model=model)
 
 
-def _accelerator_toolbox() -> Any:
+def accelerator_toolbox() -> Any:
     try:
         import at
     except ImportError as error:
@@ -126,33 +127,46 @@ def from_at(lattice: Any, *, symplectic: bool = False, model: Model | None = Non
     counterpart here or that pyAT has replaced by a drift or marker.
     """
     hint = "For the file of a lattice use rings.load(path)."
-    instance("lattice", lattice, _accelerator_toolbox().Lattice, "an at.Lattice of pyAT", hint)
+    instance("lattice", lattice, accelerator_toolbox().Lattice, "an at.Lattice of pyAT", hint)
     one_of("model", model, (None, *get_args(Model)))
-    reasons: list[str] = []
     particle = getattr(lattice, "particle", None)
     rest_energy = getattr(particle, "rest_energy", 0.0) or 0.0
     gamma = lattice.energy / rest_energy if rest_energy else math.inf
     period = lattice.get_s_pos(len(lattice))[0] / (C * math.sqrt(1 - 1 / gamma**2))
     edge, mass = "edge" if symplectic else "at_edge", rest_energy or ELECTRON
     settings = Settings(lattice.energy, period, edge, model, mass)
-    elements = []
-    for i, source in enumerate(lattice):
+    elements = convert_all(
+        lattice,
+        lambda source: _element(source, settings),
+        lambda source: f"{source.FamName} ({type(source).__name__}, {source.PassMethod})",
+    )
+    return Ring(elements, lattice.energy, int(lattice.periodicity))
+
+
+def convert_all(
+    sources: Iterable[Any], convert: Callable, label: Callable[[Any], str], place: str = "here"
+) -> list[Any]:
+    """All elements. **Raises** `ValueError` with the first ten that have no counterpart."""
+    reasons, elements = [], []
+    for i, source in enumerate(sources):
         try:
-            element = _element(source, settings)
+            elements.append(convert(source))
         except ValueError as reason:
-            reasons.append(
-                f"  {i}: {source.FamName} ({type(source).__name__}, {source.PassMethod}): {reason}"
-            )
-            continue
-        elements.append(element)
+            reasons.append(f"  {i}: {label(source)}: {reason}")
     if reasons:
         raise ValueError(
-            f"{len(reasons)} of {len(lattice)} elements have no counterpart here:\n"
+            f"{len(reasons)} of {len(reasons) + len(elements)} elements have no counterpart {place}"
+            ":\n"
             + "\n".join(
                 [*reasons[:10], *([f"  and {len(reasons) - 10} more"] * (len(reasons) > 10))]
             )
         )
-    return Ring(elements, lattice.energy, int(lattice.periodicity))
+    return elements
+
+
+def refuse(reason: str) -> NoReturn:
+    """**Raises** `ValueError`, for `convert_all`."""
+    raise ValueError(reason)
 
 
 def _element(source: Any, settings: Settings) -> Element:
@@ -161,14 +175,14 @@ def _element(source: Any, settings: Settings) -> Element:
     for name, neutral in _WITHOUT_EFFECT.items():
         value = getattr(source, name, neutral[0])
         if value not in neutral:
-            raise ValueError(f"{name} = {value} is not supported")
+            refuse(f"{name} = {value} is not supported")
     radiates = source.PassMethod in _RADIATING
     make = _MAKERS.get(source.PassMethod.replace("Rad", "") if radiates else source.PassMethod)
     if make is None:
         remedy = "; to switch it off: lattice.enable_6d(dipole_pass=None, quadrupole_pass=None)"
         radiates = any(name in source.PassMethod for name in ("Rad", "Quant"))
         message = f"radiation is not supported{remedy}" if radiates else "its map is not supported"
-        raise ValueError(message)
+        refuse(message)
     element = make(source, settings)
     if radiates:
         values = {**element.values, **constants(settings.energy, settings.mass)}
@@ -181,8 +195,8 @@ def _element(source: Any, settings: Settings) -> Element:
 
 def _placement(source: Any) -> tuple[np.ndarray, ...]:
     """R1, R1 T1, R2 and T2 in our order of coordinates."""
-    R1, R2 = (_ORDER @ getattr(source, n, np.eye(6)) @ _ORDER.T for n in ("R1", "R2"))
-    T1, T2 = (_ORDER @ getattr(source, n, np.zeros(6)) for n in ("T1", "T2"))
+    R1, R2 = (ORDER @ getattr(source, n, np.eye(6)) @ ORDER.T for n in ("R1", "R2"))
+    T1, T2 = (ORDER @ getattr(source, n, np.zeros(6)) for n in ("T1", "T2"))
     return R1, R1 @ T1, R2, T2
 
 
@@ -286,7 +300,7 @@ def _cavity(source, settings):
 
 def _matrix(source, settings):
     R1, T1, R2, T2 = _placement(source)
-    M = R2 @ _ORDER @ source.M66 @ _ORDER.T
+    M = R2 @ ORDER @ source.M66 @ ORDER.T
     values = {"length": source.Length, "matrix_in": M @ R1, "shift_in": M @ T1 + T2}
     return Element(source.FamName, "matrix", (RingPart("affine_in"),), values)
 

@@ -24,7 +24,7 @@ from ._maps import RingPart, distinct
 Where = str | int | Sequence[int]
 
 
-_READERS = {
+READERS = {
     "length": (
         "drift", "half_drift", "exact_drift", "corrector", "solenoid", "straight", "exact_straight",
         "bend", "exact_bend", "at_exact_bend", "second_order_bend",
@@ -104,6 +104,7 @@ class Ring(eqx.Module):
         values = [x for element in elements for x in element.values.values()]
         xp = jnp if any(map(is_traced, values)) else np
         names = {name: np.shape(x) for element in elements for name, x in element.values.items()}
+        names.setdefault("length", ())
         columns = {
             name: xp.stack([xp.asarray(element.values.get(name, np.zeros(shape)), float)
                             for element in elements])
@@ -140,6 +141,20 @@ class Ring(eqx.Module):
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """The elements with their parameters, at ε = 0, to make other rings of them: for example
+        ``rings.Ring(ring.elements[5:] + ring.elements[:5])`` begins with element 5."""
+        table = {k: x if is_traced(x) else np.asarray(x) for k, x in self.columns.items()}
+        parts: list[list[RingPart]] = [[] for _ in self.names]
+        for part, i in self.program.rows:
+            parts[i].append(self.program.parts[part])
+        rows = zip(self.names, self.kinds, parts, self.program.parameters, strict=True)
+        return tuple(
+            Element(name, kind, tuple(own), {k: table[k][i] for k in table if k in keys})
+            for i, (name, kind, own, keys) in enumerate(rows)
+        )
 
     @property
     def places(self) -> Array:
@@ -207,7 +222,7 @@ class Ring(eqx.Module):
 
     def _numbers(self, selection: Where, parameter: str, changes: bool = False) -> np.ndarray:
         numbers = self.where(selection)
-        readers = _READERS.get(parameter) if changes else None
+        readers = READERS.get(parameter) if changes else None
         if readers:
             part, element = np.asarray(self.program.rows).T
             reads = element[[self.program.parts[i].name in readers for i in part]]

@@ -19,6 +19,7 @@ from ...base.checks import instance, whole
 from ...base.machine import results_memory
 from ...base.printing import printable
 from ...integration.reconstruction import fold_blocks
+from ._losses import loss_places
 from ._maps import Particle
 from ._quantum import fly_with_noise
 from ._ring import Ring
@@ -32,13 +33,39 @@ class Tracked(NamedTuple):
     - `z`: (x, px, y, py, ζ, δ) after the last turn, shape (…, 6), or after every m-th turn, shape
       (…, turns/m, 6); NaN after a loss.
     - `turn`, `element`: where a particle was lost, −1 if it was not, shape (…). `last`: its
-      coordinates there, shape (…, 6), NaN if it was not lost.
+      coordinates there, shape (…, 6), NaN if it was not lost. `row`: the number of the part in
+      `ring.program.rows`, behind which it was lost. See `places` for s.
     """
 
     z: Array
     turn: Array
     element: Array
     last: Array
+    row: Array
+
+    def places(self, ring: Ring) -> Array:
+        """s of each loss [m], inside of its element, shape (…); NaN for particles that survive.
+
+        The first place at which a particle leaves the aperture or the limits of its coordinates, to
+        round-off of the map of a part of the element, in which slices have the same number: the
+        error is that of the integrator. Apertures are tested at the ends of elements, so that
+        particles that leave them and return between are not lost. A loss at the entrance, such as
+        one at a smaller pipe, is there, and one in an element that is a matrix at its end. NaN also
+        where the motion cannot be traced back, as for a momentum with no direction along s.
+
+        **Arguments** `ring`: the one that was tracked; of runs with an epsilon `ring.at(epsilon)`.
+        **Raises** `TypeError` for results that are traced by JAX.
+
+        **Example**
+
+        ```python
+        ring = rings.Ring([rings.drift("D", 2.0).inside(ellipse=(0.01, 0.01))])
+        out = rings.track(ring, [0.0, 0.008, 0.0, 0.0, 0.0, 0.0])
+        print(out.places(ring).round(6))
+        # 1.25
+        ```
+        """
+        return loss_places(ring, self.turn, self.row, self.last)
 
     @property
     def lost(self) -> Array:
@@ -104,9 +131,11 @@ def track(
     epsilon = jnp.broadcast_to(jnp.asarray(epsilon, float), shape).reshape(-1)
     counts = turns // every, every, first_turn
     fly = _track if key is None else functools.partial(fly_with_noise, key=key)
-    states, turn, element, last = fly(ring, z.reshape(-1, 6), epsilon, counts)
+    states, turn, row, last = fly(ring, z.reshape(-1, 6), epsilon, counts)
     states = states[:, -1] if turns == every else states
-    parts = states, turn, element, last
+    owner = np.asarray(ring.program.rows, np.int32)[:, 1]
+    element = jnp.where(row < 0, -1, jnp.asarray(owner)[row])
+    parts = states, turn, element, last, row
     return Tracked(*(x.reshape(*shape, *x.shape[1:]) for x in parts))
 
 
@@ -135,7 +164,7 @@ def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
 
         state = jnp.asarray(first, jnp.int32), start(Particle(*z))
         (_, flight), states = lax.scan(block, state, None, blocks)
-        return states, (flight.turn, flight.element, jnp.stack(flight.last))
+        return states, (flight.turn, flight.row, jnp.stack(flight.last))
 
     @jax.custom_jvp
     def states_and_losses(tables, z, epsilon):

@@ -28,10 +28,10 @@ Rows = dict[str, Any]
 
 
 class Flight(NamedTuple):
-    """A particle, and where it was lost: element and turn (−1 if it was not) and coordinates."""
+    """A particle, and where it was lost: part and turn (−1 if it was not) and coordinates."""
 
     z: Particle
-    element: Array
+    row: Array
     turn: Array
     last: Particle
 
@@ -55,7 +55,7 @@ def _record(flight: Flight, z: Particle, passes: Any, number: Rows, turn: Any) -
     is_inside = functools.reduce(jnp.logical_and, [size <= LARGEST for size in moduli])
     # NaN in a coordinate fails the comparison. Within an element the limit does not hold.
     passes = passes & ((is_inside & jnp.isfinite(z.zeta)) | ~number["ends"])
-    is_lost = ~passes & (flight.element < 0)
+    is_lost = ~passes & (flight.row < 0)
 
     def note():
         def select(new, old):
@@ -64,7 +64,7 @@ def _record(flight: Flight, z: Particle, passes: Any, number: Rows, turn: Any) -
         nan = Particle(*[jnp.full((), jnp.nan)] * 6)
         return Flight(
             select(nan, z),
-            select(number["element"], flight.element),
+            select(number["row"], flight.row),
             select(jnp.asarray(turn, jnp.int32), flight.turn),
             select(z, flight.last),
         )
@@ -130,7 +130,8 @@ class Passage(eqx.Module):
 
     - `rows`: the parameters b of each part at ε = 0. `slopes`: their derivatives b' by ε, of the
       parameters that depend on it; see `parameters_at`.
-    - `numbers`: of each part in `parts`, and of its element; whether the element ends there.
+    - `numbers`: of each part in `parts`, of its element and in the order of passage; whether the
+      element ends there.
     - `key`: two words for the quantum noise of `fly`; None: without noise.
     """
 
@@ -148,7 +149,8 @@ class Passage(eqx.Module):
             for columns in (ring.columns, ring.extra)
         )
         ends = np.append(element[1:] != element[:-1], True)
-        numbers = {"part": part, "element": element, "ends": ends}
+        row = np.arange(len(part), dtype=np.int32)
+        numbers = {"part": part, "element": element, "ends": ends, "row": row}
         return cls(rows, slopes, numbers, ring.program.parts)
 
     @property
