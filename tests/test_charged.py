@@ -238,6 +238,31 @@ def test_other_systems_are_refused(H, shape, message):
             )
 
 
+@pytest.mark.parametrize(
+    "method",
+    [
+        dvi.Boris(),
+        *(
+            pytest.param(m, marks=pytest.mark.slow)
+            for m in (dvi.MagneticSplitting(), dvi.HigueraCary())
+        ),
+    ],
+)
+def test_a_potential_without_a_field_is_accepted(method):
+    """A is a gradient: the particle moves uniformly, but p changes."""
+
+    def H(q, p):
+        P = p - 3 * jnp.stack([jnp.cos(q[0]) * q[1], jnp.sin(q[0]), 0 * q[0]])
+        if isinstance(method, dvi.HigueraCary):
+            return jnp.sqrt(1 + jnp.sum(P**2))
+        return jnp.sum(P**2) / 2
+
+    q, p = [0.3, 0.7, 0.1], [0.5, 0.2, 0.1]
+    sol = dvi.integrate(dvi.System(dvi.discretise(H)), q, p, h=0.1, num_steps=8, method=method)
+    assert jnp.abs(jnp.diff(sol.qs, 2, axis=0)).max() < 1e-14
+    assert jnp.abs(sol.ps[-1] - sol.ps[0]).max() > 0.1
+
+
 @pytest.mark.parametrize("method", [dvi.Boris(), dvi.MagneticSplitting()])
 def test_single_precision_stays_single(method):
     q, p = Q.astype(jnp.float32), P.astype(jnp.float32)
