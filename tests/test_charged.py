@@ -238,6 +238,31 @@ def test_other_systems_are_refused(H, shape, message):
             )
 
 
+@pytest.mark.parametrize(
+    "method",
+    [
+        dvi.Boris(),
+        *(
+            pytest.param(m, marks=pytest.mark.slow)
+            for m in (dvi.MagneticSplitting(), dvi.HigueraCary())
+        ),
+    ],
+)
+def test_a_potential_without_a_field_is_accepted(method):
+    """A is a gradient: the particle moves uniformly, but p changes."""
+
+    def H(q, p):
+        P = p - 3 * jnp.stack([jnp.cos(q[0]) * q[1], jnp.sin(q[0]), 0 * q[0]])
+        if isinstance(method, dvi.HigueraCary):
+            return jnp.sqrt(1 + jnp.sum(P**2))
+        return jnp.sum(P**2) / 2
+
+    q, p = [0.3, 0.7, 0.1], [0.5, 0.2, 0.1]
+    sol = dvi.integrate(dvi.System(dvi.discretise(H)), q, p, h=0.1, num_steps=8, method=method)
+    assert jnp.abs(jnp.diff(sol.qs, 2, axis=0)).max() < 1e-14
+    assert jnp.abs(sol.ps[-1] - sol.ps[0]).max() > 0.1
+
+
 @pytest.mark.parametrize("method", [dvi.Boris(), dvi.MagneticSplitting()])
 def test_single_precision_stays_single(method):
     q, p = Q.astype(jnp.float32), P.astype(jnp.float32)
@@ -279,3 +304,96 @@ def test_the_same_hamiltonian_in_other_forms_gives_the_same_steps():
     for form in forms:
         found = end(dvi.System(form), Q, P, dvi.Boris(), 0.1, 3)
         np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [dvi.Boris(), dvi.MagneticSplitting()])
+def test_second_derivatives(method):
+    """Reverse over reverse, against a difference of gradients."""
+
+    def loss(x):
+        q = jnp.asarray([x, -0.2, 0.5])
+        return end(WAVES, q, P, method, 0.1, 6, throw=False)[0]
+
+    curvature = jax.grad(jax.grad(loss))(0.3)
+    difference = (jax.grad(loss)(0.3 + 1e-4) - jax.grad(loss)(0.3 - 1e-4)) / 2e-4
+    assert abs(curvature - difference) < 1e-5 * abs(difference)
+
+
+@pytest.mark.parametrize(
+    "method", [dvi.Boris(), pytest.param(dvi.HigueraCary(), marks=pytest.mark.slow)]
+)
+def test_a_run_stops_at_a_plane(method):
+    """Of a motion that is uniform along z: at the right time, with the momenta of H."""
+
+    def H(q, p):
+        P = p - 0.5 * jnp.stack([-q[1], q[0], 0 * q[2]])
+        return jnp.sqrt(1 + P @ P) if isinstance(method, dvi.HigueraCary) else P @ P / 2
+
+    system = dvi.System(dvi.discretise(H))
+    sol = dvi.integrate(
+        system, [0.3, -0.2, 0.0], [0.4, 1.1, 0.5], h=0.1, num_steps=100, method=method,
+        stop=dvi.Stop(lambda t, q, p, args: q[2] - 0.575), throw=False,
+    )  # fmt: skip
+    speed = 0.5
+    if isinstance(method, dvi.HigueraCary):
+        speed = 0.5 / np.sqrt(1 + 0.5**2 + 0.3**2 + 0.95**2)
+    assert sol.status == "stopped"
+    assert abs(sol.stop.q[2] - 0.575) < 1e-14
+    assert abs(sol.stop.t - 0.575 / speed) < 1e-12
+    assert abs(sol.stop.p[2] - 0.5) < 1e-14
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [dvi.Boris(), dvi.MagneticSplitting(), dvi.HigueraCary()])
+def test_pairs_of_numbers(method):
+    """The states agree with those of float64, and have its errors of rounding no longer."""
+
+    def H(q, p):
+        P = p - jnp.stack([-q[1] * (1 + q[2] ** 2), q[0], q[0] * q[1]])
+        return jnp.sqrt(1 + P @ P) if isinstance(method, dvi.HigueraCary) else P @ P / 2
+
+    system, back = dvi.System(dvi.discretise(H)), {}
+    for name, arithmetic in (("plain", dvi.FloatingPoint()), ("pairs", dvi.DoubleDouble())):
+        run: Any = {"num_steps": 20, "method": method, "arithmetic": arithmetic}
+        sol = dvi.integrate(system, Q, P, h=0.1, **run)
+        back[name] = sol.qs[-1]
+        assert sol.status == "successful"
+    assert 0 < jnp.abs(back["plain"] - back["pairs"]).max() < 1e-12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [dvi.Boris(), dvi.MagneticSplitting()])
+def test_deviations_are_derivatives(method):
+    """The tangent map against differences of states."""
+    run: Any = {"h": 0.1, "num_steps": 10, "method": method, "save": FINAL}
+    sol = dvi.integrate(WAVES, Q, P, observe=dvi.TangentMap(), **run)
+    step = 1e-5
+    for i in range(3):
+        ends = [end(WAVES, Q.at[i].add(s), P, method, 0.1, 10) for s in (step, -step)]
+        difference = (ends[0] - ends[1]) / (2 * step)
+        assert jnp.abs(sol.observed.reshape(6, 6)[:, i] - difference).max() < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "lattice",
+    [
+        dvi.Given(jnp.asarray([0.0, 0.1, 0.25, 0.3, 0.5, 0.6])),
+        dvi.TimeTransformed(lambda q, p: 1 / (1 + q @ q)),
+        dvi.AdaptiveReversible(lambda q, p: 1 / (1 + q @ q)),
+    ],
+)
+def test_time_grids(lattice):
+    """The states are near those of Gauss's method of order 8 at the same times."""
+    run: Any = {} if isinstance(lattice, dvi.Given) else {"h": 0.05}
+
+    def H(q, p):
+        A = 0.5 * jnp.stack([-q[1] * (1 + q[2] ** 2), q[0], 0 * q[0]])
+        return jnp.sum((p - A) ** 2) / 2 + q[0] ** 2
+
+    system = dvi.System(dvi.discretise(H))
+    sol = dvi.integrate(system, Q, P, num_steps=5, lattice=lattice, method=dvi.Boris(), **run)
+    exact = end(system, Q, P, dvi.GaussLegendre(4), sol.ts[-1] / 20, 20)
+    assert jnp.abs(jnp.concatenate([sol.qs[-1], sol.ps[-1]]) - exact).max() < 2e-3
+    assert len(np.unique(np.round(np.diff(sol.ts), 12))) > 1

@@ -101,7 +101,7 @@ def known():
 )
 def test_the_example_of_the_page_prints_what_it_says(name, known, tmp_path, monkeypatch):
     code = PAGE.code[name]
-    for package in re.findall(r"^(?:import|from) (diffrax|rebound|astropy)\b", code, re.M):
+    for package in re.findall(r"^(?:import|from) (diffrax|rebound|astropy|interpax)\b", code, re.M):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     plt.switch_backend("Agg")

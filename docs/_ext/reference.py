@@ -73,6 +73,7 @@ MODULES = {
     "forces": ("Forces on planets and satellites", "forces"),
     "systems": ("Library of systems", "systems"),
     "boozer": ("Guiding centres in Boozer coordinates", "systems.boozer"),
+    "fields": ("Magnetic fields of coils and on grids", "systems.fields"),
     "rigid": ("Rotations of rigid bodies", "systems.rigid"),
     "rings": ("Storage rings", "rings"),
     "plot": ("Plots", "plot"),

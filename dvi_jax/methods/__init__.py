@@ -16,6 +16,11 @@ from ._published import (
     Yoshida as Yoshida,
 )
 from ._rattle import Rattle as Rattle
+from ._relativistic import (
+    HigueraCary as HigueraCary,
+    RelativisticBoris as RelativisticBoris,
+    Vay as Vay,
+)
 from ._runge_kutta4 import RungeKutta4 as RungeKutta4
 from ._splitting import Splitting as Splitting
 from ._stochastic import (

@@ -179,10 +179,11 @@ class _ChargedMethod(SplittingMethod):
         v = motion.velocity(t, q, p)
         rtol = 1e5 * float(jnp.finfo(q.dtype).eps)
 
-        def differ(x, y):
-            return not np.allclose(x, y, rtol=rtol, atol=rtol * np.abs(y).max())
+        def differ(x, y, term):
+            # Relative to a term as well, since the sum y may be zero.
+            return not np.allclose(x, y, rtol, rtol * np.abs(np.stack([y, term])).max())
 
-        if not (mass > 0).all() or differ(motion.momentum(t, q, v), p):
+        if not (mass > 0).all() or differ(motion.momentum(t, q, v), p, p):
             raise ValueError(
                 f"dvi.{name} requires ∂H_D/∂p1 = (p1 − A)/m with one positive mass of each "
                 f"particle, but it is not that at the initial state with m = {mass.ravel()}."
@@ -190,7 +191,8 @@ class _ChargedMethod(SplittingMethod):
         # Of all particles together, from the equations of motion themselves.
         _, transport = jax.jvp(lambda t, q: motion.velocity(t, q, p), (t, q), (jnp.ones_like(t), v))
         rate = motion.equations.momentum_rate(Interval(t, t, motion.zero), q, p)
-        if differ(motion.acceleration(t, q, v), transport + motion.inverse_mass * rate):
+        total = transport + motion.inverse_mass * rate
+        if differ(motion.acceleration(t, q, v), total, transport):
             raise ValueError(
                 f"dvi.{name} requires that A at a particle depends on its own position only."
             )

@@ -10,6 +10,7 @@ from ._gauss_legendre import GaussLegendre
 from ._lobatto_pair import LobattoIIIAIIIB
 from ._published import BlanesMoan, KahanLi, McLachlan, Suzuki, Yoshida
 from ._rattle import Rattle
+from ._relativistic import HigueraCary, RelativisticBoris, Vay
 from ._runge_kutta4 import RungeKutta4
 from ._splitting import Splitting
 from ._stochastic import BAOAB, OBABO, StochasticEuler, StochasticMidpoint, StrongSplitting
@@ -32,6 +33,7 @@ def as_method(method: Any) -> Any:
         **dict.fromkeys(("Strang", "StormerVerlet", "Verlet", "Leapfrog"), Strang),
         "Boris": Boris,
         "MagneticSplitting": MagneticSplitting,
+        **{kind.__name__: kind for kind in (RelativisticBoris, HigueraCary, Vay)},
         "Rattle": Rattle,
         "Splitting": Splitting,
         "WisdomHolman": WisdomHolman,

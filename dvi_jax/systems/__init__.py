@@ -6,7 +6,7 @@ it, because most commands make no jumps.
 """
 
 from ..base.tables import Table as _Table
-from . import boozer as boozer, rigid as rigid
+from . import boozer as boozer, fields as fields, rigid as rigid
 from ._problem import (
     Adiabatic as Adiabatic,
     InSlowTime as InSlowTime,

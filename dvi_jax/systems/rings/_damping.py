@@ -12,7 +12,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ...base.checks import electronvolts, in_range, instance, whole
 from ._maps import RingPart
-from ._optics import _FRAMES, SLICED_PARTS, closed_orbit, one_turn, optics  # pyright: ignore[reportPrivateUsage]
+from ._optics import FRAMES, SLICED_PARTS, closed_orbit, one_turn, optics
 from ._radiation import ELECTRON, constants
 from ._ring import Ring, RingStructure, Where
 
@@ -155,7 +155,7 @@ def radiation_integrals(ring: Ring) -> Array:
     """
     instance("ring", ring, Ring, "a rings.Ring")
     i = np.flatnonzero(["h" in p for p in ring.program.parameters])
-    for frame, angle in _FRAMES.items():
+    for frame, angle in FRAMES.items():
         rolled = np.intersect1d(i, _elements(ring, (f"{frame}_in",)))
         if len(rolled) and not is_traced(rolls := angle(ring.columns)[rolled]):
             hint = "The radiation integrals are those of a flat ring: use rings.equilibrium."
