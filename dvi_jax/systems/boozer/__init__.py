@@ -16,10 +16,18 @@ from ._files import (
 )
 from ._losses import LossFraction as LossFraction, loss_fraction as loss_fraction
 from ._particles import Coordinates as Coordinates, GuidingCentres as GuidingCentres
+from ._plasma import Plasma as Plasma, Rates as Rates
 from ._proxies import (
     lost_at as lost_at,
     mean_drift as mean_drift,
     radial_drift as radial_drift,
     symmetry_error as symmetry_error,
+)
+from ._slowing import End as End, SlowingDown as SlowingDown
+from ._wall import (
+    Hits as Hits,
+    Wall as Wall,
+    read_wall as read_wall,
+    wall_of_surface as wall_of_surface,
 )
 from ._waves import momentum_basis as momentum_basis
