@@ -13,6 +13,7 @@ from ...base.checks import all_finite, array, instance, known, positive, whole
 from ...base.files import user_file
 from ...base.printing import printable
 from ._files import Geometry
+from ._vmec import package
 
 _BATCH = 64
 """Segments that are compared with all triangles at once."""
@@ -140,11 +141,7 @@ def read_wall(path: Any, scale: float = 1.0) -> Wall:
     **Raises** `ImportError` without trimesh.
     """
     path = user_file("path", path)
-    try:
-        import trimesh  # pyright: ignore
-    except ImportError as error:
-        raise ImportError("boozer.read_wall requires trimesh: pip install trimesh.") from error
-    mesh = trimesh.load_mesh(str(path))
+    mesh = package("trimesh", "boozer.read_wall").load_mesh(str(path))
     return Wall(positive("scale", scale) * np.asarray(mesh.triangles, float))
 
 
