@@ -14,12 +14,22 @@ from ._files import (
     save_field as save_field,
     w7x as w7x,
 )
+from ._full_orbits import FullOrbits as FullOrbits
 from ._losses import LossFraction as LossFraction, loss_fraction as loss_fraction
 from ._particles import Coordinates as Coordinates, GuidingCentres as GuidingCentres
+from ._plasma import Plasma as Plasma, Rates as Rates
 from ._proxies import (
     lost_at as lost_at,
     mean_drift as mean_drift,
     radial_drift as radial_drift,
     symmetry_error as symmetry_error,
+)
+from ._slowing import End as End, SlowingDown as SlowingDown
+from ._vmec import read_vmec as read_vmec
+from ._wall import (
+    Hits as Hits,
+    Wall as Wall,
+    read_wall as read_wall,
+    wall_of_surface as wall_of_surface,
 )
 from ._waves import momentum_basis as momentum_basis

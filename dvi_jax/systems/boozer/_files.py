@@ -41,6 +41,11 @@ class Geometry(eqx.Module):
         R, Z, nu = (total(c, *point) for c in (self.R, self.Z, self.nu))
         return R, self.direction * (zeta - nu), Z
 
+    def cartesian(self, s: Any, theta: Any, zeta: Any) -> Array:
+        """Positions (x, y, z) [m], shape (…, 3), for arrays of one shape."""
+        R, phi, Z = self.cylindrical(s, theta, zeta)
+        return jnp.stack([R * jnp.cos(phi), R * jnp.sin(phi), Z], axis=-1)
+
 
 class _Surfaces(NamedTuple):
     """What a file holds, in right-handed coordinates with ψ ≥ 0."""

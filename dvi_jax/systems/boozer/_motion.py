@@ -45,6 +45,13 @@ def _per_action(field: Field, rho: Any, p_zeta: Any, s: Any) -> Array:
     return rho / (field.psi_edge + current * (rho * p_zeta + field.poloidal_flux(s)))
 
 
+def _ratio_of_actions(field: Field, rho: Any, p: Any, s: Any, p_zeta: Any) -> Any:
+    """p_θ at this p_ζ over that of the momenta p, both at s: finite on the axis."""
+    if field.I is None:
+        return jnp.ones_like(p_zeta)
+    return _per_action(field, rho, p[1], s) / _per_action(field, rho, p_zeta, s)
+
+
 def speed_along(field: Field, rho: Any, s: Any, p_zeta: Any, B: Any) -> Array:
     """u = v∥/v0 = (p_ζ + χ/ρ) B/G."""
     return (p_zeta + field.poloidal_flux(s) / rho) * B / polynomial(field.G, s)
@@ -76,6 +83,11 @@ class Regular(eqx.Module):
         Y, X = (y, x) if self.sign > 0 else (x, y)
         return jnp.stack([Y, zeta], axis=-1), jnp.stack([X, p_zeta], axis=-1)
 
+    def at_momentum(self, field: Field, rho: Any, q: Any, p: Any, s: Any, p_zeta: Any) -> Any:
+        """(q[0], p[0]) at the same point with another p_ζ."""
+        ratio = _ratio_of_actions(field, rho, p, s, p_zeta)
+        return q[0] * jnp.sqrt(ratio), p[0] * jnp.sqrt(ratio)
+
     def angle(self, q: Any, p: Any) -> Any:
         """θ from −π to π."""
         x, y = self._cartesian(q, p)
@@ -97,6 +109,10 @@ class Angles(eqx.Module):
     def state(self, theta: Any, zeta: Any, p_theta: Any, p_zeta: Any) -> tuple[Any, Any]:
         """(q, p)."""
         return jnp.stack([theta, zeta], axis=-1), jnp.stack([p_theta, p_zeta], axis=-1)
+
+    def at_momentum(self, field: Field, rho: Any, q: Any, p: Any, s: Any, p_zeta: Any) -> Any:
+        """(q[0], p[0]) at the same point with another p_ζ."""
+        return q[0], p[0] * _ratio_of_actions(field, rho, p, s, p_zeta)
 
     def angle(self, q: Any, p: Any) -> Any:
         """θ."""

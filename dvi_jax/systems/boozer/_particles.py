@@ -244,11 +244,17 @@ class GuidingCentres(eqx.Module):
     @property
     def loss(self) -> Stop:
         """Ends a run where the guiding centre reaches the edge, s = 1."""
-        return Stop(_Edge(self.chart))
+        return self.loss_at(1.0)
+
+    def loss_at(self, s: float) -> Stop:
+        """Ends a run where the guiding centre reaches s, which may be a wall beyond the plasma:
+        for s > 1 the polynomials of the field are continued, whose error grows quickly."""
+        return Stop(_Edge(self.chart, positive("s", s)))
 
 
 class _Edge(eqx.Module):
     chart: Any
+    s: float = eqx.field(static=True)
 
     def __call__(self, t, q, p, args):
-        return flux(self.chart, q, p, args) - 1
+        return flux(self.chart, q, p, args) - self.s
