@@ -11,7 +11,7 @@ from dvi_jax.systems import rings
 from dvi_jax.systems.rings._envelope import _moments
 from dvi_jax.systems.rings._maps import Particle
 from dvi_jax.systems.rings._optics import maps
-from dvi_jax.systems.rings._readers import _ORDER, to_at
+from dvi_jax.systems.rings._readers import ORDER, to_at
 from dvi_jax.systems.rings._turn import Passage
 
 SIZES = np.array([1e-3, 1e-4, 1e-3, 1e-4, 1e-2, 1e-3])
@@ -206,7 +206,7 @@ def test_equilibrium_agrees_with_pyat(at):
         at.DConstant.XYStep, at.DConstant.DPStep = steps
     rates = ring.period / found.damping_time
     assert close(rates, modes.damping_rates, rel=1e-8)
-    assert close(found.orbit[0], _ORDER @ start.orbit6, abs=3e-12)
+    assert close(found.orbit[0], ORDER @ start.orbit6, abs=3e-12)
     assert close(found.emittance[::2], modes.mode_emittances[::2], rel=3e-6)
     sizes = jnp.stack([found.energy_spread, found.bunch_length])
     assert close(sizes, np.sqrt(np.diag(start.r66)[[4, 5]]), rel=2e-6)
@@ -222,10 +222,10 @@ def test_equilibrium_agrees_with_pyat(at):
         if element.PassMethod.endswith("RadPass"):
             orbit = to_at(found.orbit[i])
             b = at.tracking.diffusion_matrix(element, orbit, energy=lattice.energy)
-            B += _ORDER @ b @ _ORDER.T
+            B += ORDER @ b @ ORDER.T
     M = matrices[-1]
     sigma = np.linalg.solve(np.eye(36) - np.kron(M, M), B.ravel()).reshape(6, 6)
-    theirs = _ORDER @ start.r66 @ _ORDER.T
+    theirs = ORDER @ start.r66 @ ORDER.T
     assert np.max(np.abs(sigma - theirs)) < 1e-8 * np.max(np.abs(theirs))
     assert sigma[0, 0] == pytest.approx(theirs[0, 0], rel=1e-8)
 
@@ -332,7 +332,7 @@ def test_tapering_agrees_with_pyat(at):
     # pyAT does not scale the loss with the energy of the reference particle in a magnet.
     ring = ring.set(np.flatnonzero(loss), loss=loss[loss > 0])
     _, theirs = lattice.find_orbit(range(len(lattice) + 1))
-    ours = rings.optics(ring, chromatic=False).orbit @ _ORDER
+    ours = rings.optics(ring, chromatic=False).orbit @ ORDER
     assert np.max(np.abs(ours - theirs)) < 1e-9
 
 
