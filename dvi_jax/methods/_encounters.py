@@ -141,6 +141,7 @@ def at_pericentre(h: Scalar, X: Array, V: Array, mu: Array, eta: float) -> Bool[
     jerk = factor * (V - 3 * u * X)
     snap = factor * (a - 6 * u * V - 3 * ((v2 + xa) / r2 - 5 * u * u) * X)
     a2, jerk2, snap2 = (jnp.sum(x * x, axis=-1) for x in (a, jerk, snap))
+    # Even in h and in V: a step back has the same pericentres.
     return h * h * (jerk2 + jnp.sqrt(a2 * snap2)) > 2 * eta * eta * a2
 
 

@@ -273,6 +273,7 @@ class WisdomHolman(SplittingMethod):
 
         def interaction(interval, X, V):
             # The recoil of the first body is in this part: half before the kick, half after it.
+            # At a pericentre it is in the part A.
             moves = 1 if pairs is None else jnp.where(pairs.has_recoil, 0, 1)
             X = X + moves * interval.h / 2 * frame.drift(base[1] + V)
             V, info = kick(interval, X, V)

@@ -114,9 +114,9 @@ class Request:
         check_system(system, noise_allowed=True)
         fields = dict(zip(("q0", "p0", "h", "args"), values, strict=True))
         jumps = getattr(self.system, "jumps", None) if self.jump is None else self.jump
-        fields["jump"] = jumps or None
         epsilon = system.strength(self.epsilon)
-        return dataclasses.replace(self, system=system, epsilon=epsilon, **fields)
+        fields = {**fields, "system": system, "epsilon": epsilon, "jump": jumps or None}
+        return dataclasses.replace(self, **fields)
 
     def _sweep(self) -> Sweep:
         inputs = self._inputs()
