@@ -225,8 +225,7 @@ def space_charge(
 
     **Arguments** `strength`: 2 r₀ λ L/(β²γ³) [m], λ particles per length of the beam and L the part
     of the ring; the force is repulsive. It does not depend on ζ: the beam is coasting, or the
-    particle is in the middle of its bunch. `sigma`, `offset`: as for `beam_beam`. **Example**
-    ``rings.space_charge("SC", 1e-9, (3e-3, 2e-3))``
+    particle is in the middle of its bunch. `sigma`, `offset`: as for `beam_beam`.
     """
     values = _beam(name, strength, sigma, offset)
     values["strength"] = -values["strength"]

@@ -40,8 +40,6 @@ def from_madx(sequence: Any, *, model: Model = "exact") -> Ring:
 
     **Arguments** `sequence`: such as ``Madx().sequence.ring`` after USE; it is expanded. `model`:
     see `multipole`. **Raises** `ValueError` with the elements that have no counterpart.
-
-    **Example** ``rings.from_madx(madx.sequence.ring)``
     """
     one_of("model", model, get_args(Model))
     beam = sequence.beam
