@@ -45,7 +45,7 @@ def feed_down(ring: Ring, orbit: Any = None) -> tuple[Array, Array]:
                        rings.drift("D", 1.0)])
     b, a = rings.feed_down(ring, orbit=jnp.zeros((2, 6)))
     print(b[0].round(6), a[0].round(6))
-    # [-1.5e-05 -1.0e-02  5.0e+00] [ 2.e-05 -2.e-02  0.e+00]
+    # [-1.500e-05 -9.999e-03  5.000e+00] [ 2.0000e-05 -1.9999e-02  0.0000e+00]
     ```
     """
     instance("ring", ring, Ring, "a rings.Ring")
@@ -59,8 +59,8 @@ def feed_down(ring: Ring, orbit: Any = None) -> tuple[Array, Array]:
     result = jnp.zeros((len(ring), orders), complex)
     for parts, members in groups.items():
         table = {key: column[np.asarray(members)] for key, column in ring.columns.items()}
-        about = jax.vmap(functools.partial(_about, parts))
-        values = about(table, orbit[np.asarray(members)])
+        expand = jax.vmap(functools.partial(_expansion, parts))
+        values = expand(table, orbit[np.asarray(members)])
         names = [part.name.removesuffix("_in") for part in parts if part.name.endswith("_in")]
         angle = sum(
             (FRAMES[name](table) for name in names if name in FRAMES), jnp.zeros(len(values))
@@ -70,7 +70,7 @@ def feed_down(ring: Ring, orbit: Any = None) -> tuple[Array, Array]:
     return jnp.real(result), jnp.imag(result)
 
 
-def _about(parts: Parts, par: Parameters, orbit: Array) -> Array:
+def _expansion(parts: Parts, par: Parameters, orbit: Array) -> Array:
     """b_m + i a_m about the orbit of a magnet, in its own frame."""
     z, points, weights = Particle(*orbit), *np.polynomial.legendre.leggauss(5)
     number = next(i for i, part in enumerate(parts) if part.name in _MAGNETS)

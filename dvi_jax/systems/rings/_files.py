@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...base.keywords import user_level
-from ._xsuite import fold_limits, replaced
+from ._xsuite import counterpart, fold_limits
 
 _PARSERS = {
     ".seq": "MadxParser", ".madx": "MadxParser", ".mad8": "Mad8Parser", ".lte": "ElegantParser",
@@ -229,8 +229,8 @@ def _of_xsuite(data: dict[str, Any], path: Path, use: str | None, options: dict[
     with contextlib.redirect_stdout(io.StringIO()):  # pyAT prints what it does not know
         line = XsLine.from_dict(data, use=use)
     unread = {name: _unread_of_xsuite(element) for name, element in line.elements.items()}
-    more = data.get("metadata", {})  # of `save`: what a line of Xsuite does not have
-    options = {"periodicity": more.get("periodicity", 1), **options}
+    metadata = data.get("metadata", {})  # of `save`: what a line of Xsuite does not have
+    options = {"periodicity": metadata.get("periodicity", 1), **options}
     with warnings.catch_warnings():
         warnings.filterwarnings(
             "ignore", message=".*unknown class (Limit(Rect|Ellipse)|UniformSolenoid) "
@@ -242,9 +242,9 @@ def _of_xsuite(data: dict[str, Any], path: Path, use: str | None, options: dict[
         if gap is not None:
             element.FullGap = 2 * gap  # pyAT 0.9.0 takes the half gap for the gap
     contents = [line.elements[name] for name in line.element_names]
-    elements = [replaced(*pair, at) for pair in zip(lattice, contents, strict=True)]
+    elements = [counterpart(*pair, at) for pair in zip(lattice, contents, strict=True)]
     lattice[:] = fold_limits(line.element_names, elements)
-    for element, name in zip(lattice, more.get("names", ()), strict=False):
+    for element, name in zip(lattice, metadata.get("names", ()), strict=False):
         element.FamName = name
     return lattice
 

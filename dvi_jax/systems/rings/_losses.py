@@ -129,9 +129,9 @@ def loss_places(ring: Ring, turn: Any, row: Any, last: Any) -> Array:
         owner, thick = element[flat[members]], spans(parts)
         if any(i <= end for i in thick):
             size = 1 << (len(members) - 1).bit_length()  # one program for similar numbers
-            chosen = np.resize(members, size)
-            table = {k: column[element[flat[chosen]]] for k, column in columns.items()}
-            states = last.reshape(-1, 6)[chosen], turn.ravel()[chosen]
+            indices = np.resize(members, size)
+            table = {k: column[element[flat[indices]]] for k, column in columns.items()}
+            states = last.reshape(-1, 6)[indices], turn.ravel()[indices]
             share = np.asarray(_shares(parts, end, table, *states))[: len(members)]
         else:
             share = 0.0 if thick else float(2 * end + 1 >= len(parts))
@@ -160,7 +160,7 @@ def beam_pipe(ring: Ring, s: Any, *, ellipse: Any = None, rectangle: Any = None)
     ring = rings.beam_pipe(rings.Ring([rings.drift("D", 4.0)]), [0.0, 4.0],
                            ellipse=[[0.02, 0.01], [0.01, 0.01]])
     out = rings.track(ring, [0.0, 0.008, 0.0, 0.0, 0.0, 0.0])
-    print(out.places(ring).round(6))
+    print(f"{out.places(ring):.6f}")
     # 1.904762
     ```
     """

@@ -40,8 +40,6 @@ def from_madx(sequence: Any, *, model: Model = "exact") -> Ring:
 
     **Arguments** `sequence`: such as ``Madx().sequence.ring`` after USE; it is expanded. `model`:
     see `multipole`. **Raises** `ValueError` with the elements that have no counterpart.
-
-    **Example** ``rings.from_madx(madx.sequence.ring)``
     """
     one_of("model", model, get_args(Model))
     beam = sequence.beam
@@ -90,7 +88,7 @@ def _of_madx(source: Any, beam: Any, model: Model) -> Element:
 def _plain(
     name: str, kind: str, length: float, values: Any, energy: float, revolution: float, model: Model
 ) -> Element:
-    """An element from the attributes of MAD-X. **Raises** `ValueError` if there is none."""
+    """An element from the attributes of MAD-X. **Raises** `ValueError` for others."""
     get = values.get
     if kind in _FIELD_FREE:
         return drift(name, length, model) if length else marker(name, kind)
@@ -111,13 +109,13 @@ def _plain(
     knl, ksl = (np.zeros(21) for _ in range(2))
     for column, suffix, key in ((knl, "", "knl"), (ksl, "s", "ksl")):
         column[:4] = [get(f"k{n}{suffix}", 0.0) * scale for n in range(4)]
-        more = np.atleast_1d(get(key, 0.0))
-        column[: len(more)] += more
+        integrated = np.atleast_1d(get(key, 0.0))
+        column[: len(integrated)] += integrated
     if kind == "multipole" and (knl[0] or ksl[0] or get("angle")):
         refuse("KNL[0], KSL[0] or ANGLE bend the reference orbit of a thin element")
     last = max([n for n in range(21) if knl[n] or ksl[n]], default=0)
     factors = scale * np.array([math.factorial(n) for n in range(last + 1)])
-    field = {"b": knl[: last + 1] / factors, "a": ksl[: last + 1] / factors}
+    field: dict[str, Any] = {"b": knl[: last + 1] / factors, "a": ksl[: last + 1] / factors}
     if not is_bend:
         return multipole(name, length, **field, kind=kind, model=model)
     angle, gap = get("angle", 0.0), 2 * get("hgap", 0.0)
@@ -135,7 +133,7 @@ def _plain(
 def from_latticejson(lattice: dict[str, Any], *, model: Model = "exact") -> Ring:
     """The ring in LatticeJSON, version 2, as ``json.load`` or ``latticejson.load`` return it.
 
-    Its energy is in GeV, here 1 GeV if there is none. **Raises** `ValueError` with the elements
+    Its energy is in GeV, here 1 GeV without one. **Raises** `ValueError` with the elements
     that have no counterpart: tilt, dx and others, apertures, and cavities with a voltage.
 
     **Example**
@@ -157,9 +155,9 @@ def from_latticejson(lattice: dict[str, Any], *, model: Model = "exact") -> Ring
 
     def convert(name):
         kind, values = data["elements"][name]
-        unknown = sorted(key for key in values.keys() - _LATTICE_JSON.keys() if values[key])
-        if unknown:
-            refuse(f"{', '.join(unknown)} is not supported")
+        names = sorted(key for key in values.keys() - _LATTICE_JSON.keys() if values[key])
+        if names:
+            refuse(f"{', '.join(names)} is not supported")
         values = {_LATTICE_JSON[key]: value for key, value in values.items()}
         if kind == "Cavity" and values.get("volt"):
             refuse("the zero and the unit of its phase are not defined")

@@ -16,7 +16,7 @@ from ._maps import LIMITS, Particle, RingPart, forward
 from ._parts import pieces_of
 from ._readers import ORDER, accelerator_toolbox, convert_all, refuse
 from ._ring import Ring
-from ._xsuite import written
+from ._xsuite import content_of
 
 _FRAMES = "placed", "tilted", "affine"
 _PASSES = {
@@ -48,14 +48,16 @@ def save(
     **Example**
 
     ```python
+    import tempfile
     ring = rings.Ring([rings.quadrupole("Q", 0.5, k1=0.6).placed(dx=1e-4), rings.drift("D", 2.0)])
-    rings.save(ring, "ring.mat")
-    print(rings.load("ring.mat").names)
+    with tempfile.TemporaryDirectory() as folder:
+        rings.save(ring, f"{folder}/ring.mat")
+        print(rings.load(f"{folder}/ring.mat").names)
     # ('Q', 'D')
     ```
     """
     instance("ring", ring, Ring, "a rings.Ring").check()
-    at, path = accelerator_toolbox(), Path(path)
+    toolbox, path = accelerator_toolbox(), Path(path)
     one_of("end of path", path.suffix, (".json",) if format == "xsuite" else _SUFFIXES)
     for key, column in ring.columns.items():
         known(key, column)
@@ -67,11 +69,11 @@ def save(
         return f"{element.name} ({element.kind})"
 
     elements = convert_all(
-        ring.elements, lambda x: convert(x, at, ring.energy, period), label, "in this format"
+        ring.elements, lambda x: convert(x, toolbox, ring.energy, period), label, "in this format"
     )
     if is_at:
-        lattice = at.Lattice(elements, energy=ring.energy, periodicity=ring.periods)
-        at.save_lattice(lattice, str(path))
+        lattice = toolbox.Lattice(elements, energy=ring.energy, periodicity=ring.periods)
+        toolbox.save_lattice(lattice, str(path))
         return
     table, names = {}, []
     for pieces in elements:
@@ -90,8 +92,8 @@ def save(
         "element_names": names,
         "particle_ref": particle,
     }
-    more = {"periodicity": ring.periods, "names": ring.names}
-    path.write_text(json.dumps(line | {"metadata": more}, indent=1))
+    metadata = {"periodicity": ring.periods, "names": ring.names}
+    path.write_text(json.dumps(line | {"metadata": metadata}, indent=1))
 
 
 _SUFFIXES = ".mat", ".m", ".json", ".repr"
@@ -126,58 +128,64 @@ def _layers(element: Element) -> tuple[list[RingPart], list[str], dict[str, Any]
     return parts, frames, apertures
 
 
-def _at_element(element: Element, at: Any, energy: float, period: float) -> Any:
-    """The element of pyAT. **Raises** `ValueError` with the reason if there is none."""
+def _at_element(element: Element, toolbox: Any, energy: float, period: float) -> Any:
+    """The element of pyAT. **Raises** `ValueError` with the reason for others."""
     parts, frames, attributes = _layers(element)
     if frames:
         ends = {}
         for side, order in (("in", 1), ("out", -1)):
             M, v = np.eye(6), np.zeros(6)
             for frame in frames[::order]:
-                more, shift = _matrix(RingPart(f"{frame}_{side}"), element.values)
-                M, v = more @ M, more @ v + shift
+                A, shift = _matrix(RingPart(f"{frame}_{side}"), element.values)
+                M, v = A @ M, A @ v + shift
             ends[side] = M, v
         (M, v), (N, w) = ends["in"], ends["out"]
         attributes |= {"R1": ORDER.T @ M @ ORDER, "T1": ORDER.T @ np.linalg.solve(M, v)}
         attributes |= {"R2": ORDER.T @ N @ ORDER, "T2": ORDER.T @ w}
-    return _core(element, parts, attributes, at, energy, period)
+    return _core(element, parts, attributes, toolbox, energy, period)
 
 
-def _xsuite_element(element: Element, at: Any, energy: float, period: float) -> dict[str, Any]:
-    source = _at_element(element, at, energy, period)
-    content = written(source, element, _layers(element)[1])
+def _xsuite_element(element: Element, toolbox: Any, energy: float, period: float) -> dict[str, Any]:
+    source = _at_element(element, toolbox, energy, period)
+    content = content_of(source, element, _layers(element)[1])
     return refuse(content) if isinstance(content, str) else content
 
 
 def _core(
-    element: Element, parts: list[RingPart], attributes: dict[str, Any], at: Any, energy: float,
+    element: Element,
+    parts: list[RingPart],
+    attributes: dict[str, Any],
+    toolbox: Any,
+    energy: float,
     period: float,
-) -> Any:  # fmt: skip
+) -> Any:
     names, values = {part.name: part for part in parts}, element.values
     length = float(values.get("length", 0.0))
     attributes |= {"FamName": element.name, "Length": length}
 
-    def made(kind: Any, method: str, **more: Any) -> Any:
-        return kind.from_file({**attributes, "PassMethod": method, **more})
+    def build(kind: Any, method: str, **options: Any) -> Any:
+        return kind.from_file({**attributes, "PassMethod": method, **options})
 
     if not parts:
-        kind = at.Monitor if element.kind == "monitor" else at.Marker
-        return made(kind if length == 0 else at.Element, "IdentityPass")
+        kind = toolbox.Monitor if element.kind == "monitor" else toolbox.Marker
+        return build(kind if length == 0 else toolbox.Element, "IdentityPass")
     if names.keys() == {"drift"} or names.keys() == {"exact_drift"}:
         method = "DriftPass" if "drift" in names else "ExactDriftPass"
-        return made(at.Drift, method)
+        return build(toolbox.Drift, method)
     if names.keys() == {"rectangle"}:
         limits = [float(values[key]) for key in LIMITS["rectangle"]]
-        return made(at.Aperture, "AperturePass", Limits=np.array(limits))
+        return build(toolbox.Aperture, "AperturePass", Limits=np.array(limits))
     if names.keys() == {"corrector"}:
         kicks = np.array([float(values["kick_x"]), float(values["kick_y"])])
-        return made(at.Corrector, "CorrectorPass", KickAngle=kicks)
+        return build(toolbox.Corrector, "CorrectorPass", KickAngle=kicks)
     if names.keys() == {"solenoid"}:
-        return made(at.Element, "SolenoidLinearPass", K=float(values["ks"]))
+        return build(toolbox.Element, "SolenoidLinearPass", K=float(values["ks"]))
     if names.keys() == {"affine_in"}:
         if np.any(values["shift_in"]):
             attributes["T2"] = ORDER.T @ np.asarray(values["shift_in"])
-        return made(at.M66, "Matrix66Pass", M66=ORDER.T @ np.asarray(values["matrix_in"]) @ ORDER)
+        return build(
+            toolbox.M66, "Matrix66Pass", M66=ORDER.T @ np.asarray(values["matrix_in"]) @ ORDER
+        )
     if "cavity" in names and names.keys() <= {"cavity", "half_drift"}:
         frequency = float(values["wave_number"]) * C / (2 * math.pi)
         slip, turns = float(values["slip"]) / (2 * math.pi), frequency * period
@@ -185,8 +193,8 @@ def _core(
             refuse("cavities have no apertures and no misalignments there")
         if slip and abs(slip + turns - round(slip + turns)) > 1e-9 * turns:
             refuse("the slip of its phase is not that of a harmonic number")
-        return made(
-            at.RFCavity, "RFCavityPass" if slip else "CavityPass", Frequency=frequency,
+        return build(
+            toolbox.RFCavity, "RFCavityPass" if slip else "CavityPass", Frequency=frequency,
             Voltage=float(values["voltage"]) * energy, Energy=energy, TimeLag=float(values["lag"]),
             HarmNumber=round(slip + turns), PhaseLag=float(values["phase"]),
         )  # fmt: skip
@@ -206,15 +214,19 @@ def _core(
         attributes[f"Polynom{key.upper()}"] = np.array(field)
     attributes["MaxOrder"] = body.order
     if body.name == "thin":
-        return made(at.ThinMultipole, _PASSES["thin"])
+        return build(toolbox.ThinMultipole, _PASSES["thin"])
     is_exact = body.name.endswith(("exact_bend", "exact_straight"))
     fringe = {"exact_bend": "gradient_fringe", "at_exact_bend": "gradient_fringe",
               "exact_straight": "multipole_fringe"}.get(body.name, "fringe")  # fmt: skip
     attributes |= {f"FringeQuad{end}": int(f"{fringe}_{side}" in names) for side, end in _ENDS}
     attributes["NumIntSteps"] = body.slices
     if "h" not in values:
-        kinds = {"quadrupole": at.Quadrupole, "sextupole": at.Sextupole, "octupole": at.Octupole}
-        return made(kinds.get(element.kind, at.Multipole), _PASSES[body.name])
+        kinds = {
+            "quadrupole": toolbox.Quadrupole,
+            "sextupole": toolbox.Sextupole,
+            "octupole": toolbox.Octupole,
+        }
+        return build(kinds.get(element.kind, toolbox.Multipole), _PASSES[body.name])
     if body.name == "exact_straight":
         refuse("an exact bend without an angle is not there")
     attributes |= {"BendingAngle": float(values["h"]) * length}
@@ -232,7 +244,7 @@ def _core(
             refuse("its ends have different fringe fields")
         attributes["gK"] = gaps[0]
     attributes["FullGap"] = 1.0
-    return made(at.Dipole, _PASSES[body.name])
+    return build(toolbox.Dipole, _PASSES[body.name])
 
 
 _EDGES = {

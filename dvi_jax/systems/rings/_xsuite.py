@@ -16,7 +16,7 @@ _LIMITS = {
 }
 
 
-def written(source: Any, element: Element, frames: list[str]) -> dict[str, dict[str, Any]] | str:
+def content_of(source: Any, element: Element, frames: list[str]) -> dict[str, dict[str, Any]] | str:
     """Names and contents for Xsuite, in order, from the element of pyAT; the reason if there is no
     counterpart."""
     kind, length, name = type(source).__name__, float(source.Length), source.FamName
@@ -58,12 +58,12 @@ def written(source: Any, element: Element, frames: list[str]) -> dict[str, dict[
         if has_both or "affine" in frames or limits or not is_field:
             return "only magnets are placed or tilted, not both, and without an aperture"
         content |= moves | {"rot_shift_anchor": 0.0}
-    before, after = {}, {}
+    heads, tails = {}, {}
     for key, values in limits.items():
         limit = {"__class__": key, **dict(zip(_LIMITS[key][1], values, strict=True))}
-        before[f"{name}_{key}_entry"] = limit
-        after = {f"{name}_{key}_exit": limit, **after}
-    return {**before, name: content, **after}
+        heads[f"{name}_{key}_entry"] = limit
+        tails = {f"{name}_{key}_exit": limit, **tails}
+    return {**heads, name: content, **tails}
 
 
 def _field(source: Any, kind: str, is_exact: bool) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def _edges(source: Any, is_exact: bool) -> dict[str, Any] | str:
     return content
 
 
-def replaced(source: Any, content: dict[str, Any], at: Any) -> Any:
+def counterpart(source: Any, content: dict[str, Any], toolbox: Any) -> Any:
     """The element that pyAT makes of one of Xsuite, with what it leaves out or misreads."""
     kind = content.get("__class__")
     element, names = source, ()
@@ -118,13 +118,13 @@ def replaced(source: Any, content: dict[str, Any], at: Any) -> Any:
         key, names = _LIMITS[kind]
         ends = {"min_x": -1e10, "min_y": -1e10}
         values = np.array([content.get(k, ends.get(k, 1e10)) for k in names])
-        element = at.Marker(source.FamName, **{key: values})
+        element = toolbox.Marker(source.FamName, **{key: values})
         if kind == "LimitRect":
-            element = at.Aperture(source.FamName, values)
+            element = toolbox.Aperture(source.FamName, values)
     elif kind == "UniformSolenoid" and content["length"]:
         names = "length", "ks", "order", "num_multipole_kicks"
-        element = at.Element(source.FamName, Length=content["length"], K=content.get("ks", 0.0),
-                             PassMethod="SolenoidLinearPass")  # fmt: skip
+        values = {"Length": content["length"], "K": content.get("ks", 0.0)}
+        element = toolbox.Element(source.FamName, PassMethod="SolenoidLinearPass", **values)
     if element is not source:
         element.unread = {key: value for key, value in content.items() if key not in names}
         return element
@@ -143,7 +143,7 @@ def replaced(source: Any, content: dict[str, Any], at: Any) -> Any:
 def fold_limits(names: list[str], elements: list[Any]) -> list[Any]:
     """Elements with the apertures that `save` has written before and after them."""
     result = list(zip(names, elements, strict=True))
-    for key, (attribute, _) in reversed(_LIMITS.items()):  # the order of `written`, from inside
+    for key, (attribute, _) in reversed(_LIMITS.items()):  # the order of `content_of`, from inside
         i = 0
         while i < len(result) - 2:
             first, (name, element), last = result[i : i + 3]
