@@ -92,7 +92,7 @@ def main():
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     options = parser.parse_args()
     print("| field | method | steps per gyration | gyrations | energy error, first tenth | all | "
-          "range/mean of μ, first tenth | all | change of mean μ | processor time | status |")  # fmt: skip
+          "range/mean of μ, first tenth | all | change of mean μ | time | status |")  # fmt: skip
     print("|" + "---|" * 11)
     for case in options.cases:
         for name in options.methods:
