@@ -3,8 +3,8 @@
     python benchmarks/charged.py [--gyrations 1e7] [--cases mirror potential] [--methods Boris ...]
 
 Two fields: the magnetic mirror of the library (ℓ = 20), whose particle has only a magnetic field;
-and the field B = (0, 0, r) with the potential x³ − y³ + x⁴/5 + y⁴ + z⁴ of Hairer & Lubich 2018
-(*BIT* 58, 969), which has no symmetry. One table row for each method. Errors are those of 2000
+and the field B = (0, 0, r) with the potential x³ − y³ + x⁴/5 + y⁴ + z⁴ (compare Hairer & Lubich
+2018, *BIT* 58, 969), which has no symmetry. One row for each method. Errors are those of 2000
 states at equal distances in the run: in its first tenth and in all of it.
 """
 
