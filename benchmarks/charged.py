@@ -3,8 +3,8 @@
     python benchmarks/charged.py [--gyrations 1e7] [--cases mirror potential] [--methods Boris ...]
 
 Two fields: the magnetic mirror of the library (ℓ = 20), whose particle has only a magnetic field;
-and the field B = (0, 0, r) with the potential x³ − y³ + x⁴/5 + y⁴ + z⁴ of Hairer & Lubich 2018
-(*BIT* 58, 969), which has no symmetry. One table row for each method. Errors are those of 2000
+and the field B = (0, 0, r) with the potential x³ − y³ + x⁴/5 + y⁴ + z⁴ (compare Hairer & Lubich
+2018, *BIT* 58, 969), which has no symmetry. One row for each method. Errors are those of 2000
 states at equal distances in the run: in its first tenth and in all of it.
 """
 
@@ -92,7 +92,7 @@ def main():
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     options = parser.parse_args()
     print("| field | method | steps per gyration | gyrations | energy error, first tenth | all | "
-          "range/mean of μ, first tenth | all | change of mean μ | processor time | status |")  # fmt: skip
+          "range/mean of μ, first tenth | all | change of mean μ | time | status |")  # fmt: skip
     print("|" + "---|" * 11)
     for case in options.cases:
         for name in options.methods:

@@ -380,7 +380,6 @@ def test_deviations_are_derivatives(method):
     "lattice",
     [
         dvi.Given(jnp.asarray([0.0, 0.1, 0.25, 0.3, 0.5, 0.6])),
-        dvi.TimeTransformed(lambda q, p: 1 / (1 + q @ q)),
         dvi.AdaptiveReversible(lambda q, p: 1 / (1 + q @ q)),
     ],
 )
@@ -397,3 +396,9 @@ def test_time_grids(lattice):
     exact = end(system, Q, P, dvi.GaussLegendre(4), sol.ts[-1] / 20, 20)
     assert jnp.abs(jnp.concatenate([sol.qs[-1], sol.ps[-1]]) - exact).max() < 2e-3
     assert len(np.unique(np.round(np.diff(sol.ts), 12))) > 1
+
+
+def test_a_time_grid_with_time_as_a_coordinate_is_refused():
+    lattice = dvi.TimeTransformed(lambda q, p: 1 / (1 + q @ q))
+    with pytest.raises(ValueError, match=r"shape \(4,\)"):
+        dvi.integrate(WAVES, Q, P, h=0.1, num_steps=2, lattice=lattice, method=dvi.Boris())

@@ -55,8 +55,8 @@ class _Fields(NamedTuple):
 
     def potential(self, t: Scalar, q: State) -> State:
         """A, from the components of v across a very large momentum: v_j = −c A_j/p."""
-        first, second = (self._at_largest(self._velocity, t, q, axis) for axis in (0, 1))
-        v = jnp.concatenate([second[..., :1], first[..., 1:]], axis=-1)
+        along_x, along_y = (self._at_largest(self._velocity, t, q, axis) for axis in (0, 1))
+        v = jnp.concatenate([along_y[..., :1], along_x[..., 1:]], axis=-1)
         return -self.largest / self.c * v
 
     def velocity(self, P: State) -> State:
@@ -94,10 +94,10 @@ class _Fields(NamedTuple):
 
         # Of W − W(v = 0) = v × B at velocities c along the first two axes.
         at_rest = force(t, q, self.potential(t, q))
-        first, second = (self._at_largest(force, t, q, axis) - at_rest for axis in (0, 1))
+        along_x, along_y = (self._at_largest(force, t, q, axis) - at_rest for axis in (0, 1))
         if n == 2:
-            return B - first[..., 1:] / self.c
-        of_force = jnp.stack([-second[..., 2], first[..., 2], -first[..., 1]], axis=-1)
+            return B - along_x[..., 1:] / self.c
+        of_force = jnp.stack([-along_y[..., 2], along_x[..., 2], -along_x[..., 1]], axis=-1)
         return B + of_force / self.c
 
 
@@ -108,19 +108,19 @@ def _cross(v: State, B: Array) -> State:
     return jnp.cross(v, B)
 
 
-def _dot(a: Array, b: Array) -> Array:
-    return jnp.sum(a * b, axis=-1, keepdims=True)
+def _dot(left: Array, right: Array) -> Array:
+    return jnp.sum(left * right, axis=-1, keepdims=True)
 
 
 def _implicit_gamma(fields: _Fields, start: State, half: Array) -> Array:
     """γ of the momentum P = start + P × half/γ: the root of a quadratic equation."""
     along = 0.0 if start.shape[-1] == 2 else _dot(start / (fields.mass * fields.c), half)
     square = _dot(half, half)
-    s, x = fields.square(start) - square, square + along * along
-    root = jnp.sqrt(s * s + 4 * x)
-    # The other form of the same root has no cancellation where s is negative.
-    below = jnp.where(s > 0, 1.0, root - s)
-    return jnp.sqrt(jnp.where(s > 0, (s + root) / 2, 2 * x / below))
+    linear, constant = fields.square(start) - square, square + along * along
+    root = jnp.sqrt(linear * linear + 4 * constant)
+    # The other form of the same root has no cancellation where `linear` is negative.
+    below = jnp.where(linear > 0, 1.0, root - linear)
+    return jnp.sqrt(jnp.where(linear > 0, (linear + root) / 2, 2 * constant / below))
 
 
 def _middle(fields: _Fields, start: State, half: Array, gamma: Array) -> State:

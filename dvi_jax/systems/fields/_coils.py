@@ -54,15 +54,15 @@ class Filaments(eqx.Module):
 
     def vector_potential(self, q: Any) -> Array:
         """A [T m] at a position [m], both of shape (3,)."""
-        d = _displacement(jnp.asarray(q), self.points)
-        inverse = 1 / jnp.sqrt(jnp.sum(d * d, axis=0))
+        offset = _displacement(jnp.asarray(q), self.points)
+        inverse = 1 / jnp.sqrt(jnp.sum(offset * offset, axis=0))
         return _total(self.currents, jnp.moveaxis(self.tangents, -1, 0) * inverse[None])
 
     def magnetic_field(self, q: Any) -> Array:
         """B [T] at a position [m], both of shape (3,)."""
-        d = _displacement(jnp.asarray(q), self.points)
-        square = jnp.sum(d * d, axis=0)
-        normal = jnp.cross(jnp.moveaxis(self.tangents, -1, 0), d, axis=0)
+        offset = _displacement(jnp.asarray(q), self.points)
+        square = jnp.sum(offset * offset, axis=0)
+        normal = jnp.cross(jnp.moveaxis(self.tangents, -1, 0), offset, axis=0)
         return _total(self.currents, normal * (1 / (square * jnp.sqrt(square)))[None])
 
 
@@ -124,20 +124,21 @@ class Polylines(eqx.Module):
         array("currents", self.currents, self.points.shape[:1])
 
     def _wires(self, q: Any) -> tuple[Array, ...]:
-        d = _displacement(jnp.asarray(q), self.points)
-        distance = jnp.sqrt(jnp.sum(d * d, axis=0))
+        offset = _displacement(jnp.asarray(q), self.points)
+        distance = jnp.sqrt(jnp.sum(offset * offset, axis=0))
         wire = jnp.moveaxis(self.points[:, 1:] - self.points[:, :-1], -1, 0)
         length = jnp.sqrt(jnp.sum(wire * wire, axis=0))
-        return wire, length, d[..., :-1], distance[:, :-1], distance[:, 1:]
+        return wire, length, offset[..., :-1], distance[:, :-1], distance[:, 1:]
 
     def vector_potential(self, q: Any) -> Array:
         """A [T m] at a position [m], both of shape (3,)."""
-        wire, length, _, a, b = self._wires(q)
-        size = jnp.log1p(2 * length / (a + b - length)) / length
+        wire, length, _, start, end = self._wires(q)
+        size = jnp.log1p(2 * length / (start + end - length)) / length
         return _total(self.currents, wire * size[None])
 
     def magnetic_field(self, q: Any) -> Array:
         """B [T] at a position [m], both of shape (3,)."""
-        wire, length, d, a, b = self._wires(q)
-        size = 2 * (a + b) / (a * b * ((a + b) ** 2 - length**2))
-        return _total(self.currents, jnp.cross(wire, d, axis=0) * size[None])
+        wire, length, offset, start, end = self._wires(q)
+        path = start + end
+        size = 2 * path / (start * end * (path**2 - length**2))
+        return _total(self.currents, jnp.cross(wire, offset, axis=0) * size[None])
