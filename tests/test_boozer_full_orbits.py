@@ -98,7 +98,7 @@ def test_the_field_in_real_space_is_the_exact_one():
 
 @slow
 def test_the_round_trip_is_of_second_order():
-    """In a twisted field: x_c, u and μ come back with errors ∝ ε², and the phase exactly."""
+    """In a twisted field: x_c, u and μ with errors ∝ ε², and the phase exactly."""
     changes = []
     for scale in (1.0, 2.0, 4.0):
         orbit = orbits(scale, 0.7)

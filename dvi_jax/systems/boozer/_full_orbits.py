@@ -148,9 +148,9 @@ class FullOrbits(eqx.Module):
         parts = jnp.sum(v * e1), jnp.sum(v * e2), jnp.sum(v * jnp.cross(e1, e2))
         size, phase = jnp.sqrt(parts[0] ** 2 + parts[1] ** 2), jnp.arctan2(parts[1], parts[0])
         rho, correction = self._local(B, slopes, parts[2], size, phase)
-        u, place = parts[2] + correction, self.coordinates_of(x - rho)
-        q, p, _ = self.particles.state(*place, u)
-        strength = self.particles.field.strength(*place)
+        u, (s, theta, zeta) = parts[2] + correction, self.coordinates_of(x - rho)
+        q, p, _ = self.particles.state(s, theta, zeta, u)
+        strength = self.particles.field.strength(s, theta, zeta)
         return q, p, self.particles.args((jnp.sum(v**2) - u**2) / (2 * strength)), phase
 
     @eqx.filter_jit

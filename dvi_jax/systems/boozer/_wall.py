@@ -78,7 +78,11 @@ class Wall(eqx.Module):
         flat = np.where(is_before[..., None], flat, np.nan)
         count, last = len(flat), max(flat.shape[1] - 1, 1)
         starts, ends = (x.reshape(-1, 3) for x in (flat[:, :-1], flat[:, 1:]))
-        fractions, indices = (np.asarray(x) for x in _first(self.triangles, starts, ends))
+        fractions, indices = np.full(len(starts), np.nan), np.zeros(len(starts), int)
+        # Most paths of a batch have ended: in sizes of powers of two, for few compilations.
+        if (finite := np.flatnonzero(np.isfinite(ends).all(-1))).size:
+            rows = np.resize(finite, 1 << (finite.size - 1).bit_length())
+            fractions[rows], indices[rows] = _first(self.triangles, starts[rows], ends[rows])
         fractions = fractions.reshape(count, last)
         step = np.argmax(np.isfinite(fractions), axis=1)
         rows = np.arange(count)
