@@ -113,11 +113,11 @@ def emittance(k):
 
 
 _, slope = jax.jvp(emittance, (1.3,), (1.0,))
-step = 1e-4
+step = 1e-3
 difference = (emittance(1.3 + step) - emittance(1.3 - step)) / (2 * step)
 print(f"dε/dk = {1e9 * slope:.4f} nm m², by differences {1e9 * difference:.4f} nm m²")
-assert abs(slope / difference - 1) < 1e-5
-ks = np.linspace(1.0, 1.6, 13)
+assert abs(slope / difference - 1) < 1e-3
+ks = np.linspace(1.0, 1.6, 7)
 values = 1e9 * np.array([emittance(k) for k in ks])
 _, axis = plt.subplots(figsize=(6, 3.5), layout="constrained")
 axis.plot(ks, values, "o-", ms=3)
@@ -132,7 +132,7 @@ plt.show()
 # aperture are lost. More vertical emittance makes the bunch less dense, so that it lives longer.
 
 # %%
-aperture = rings.momentum_aperture(ring, turns=200, where="[BQ]*", largest=0.05)
+aperture = rings.momentum_aperture(ring, turns=200, where="[BQ]*", largest=0.05, steps=8)
 print(f"momentum aperture from {aperture[:, 0].max():.4f} to {aperture[:, 1].min():.4f}")
 couplings = np.array([0.001, 0.003, 0.01, 0.03, 0.1])
 hours = [
