@@ -21,7 +21,7 @@ for needed in ("jupytext", "nbclient", "nbformat", "ipykernel"):
 NAMES = [
     "alpha_particles", "discovering_invariants", "events", "fitting", "general_relativity", "gpu",
     "how_long", "limits", "magnetic_moment", "planets", "polar_motion", "quick_start",
-    "radiating_ring", "storage_ring", "sweeps", "the_paper", "your_own_system",
+    "storage_ring", "sweeps", "the_paper", "your_own_system",
 ]  # fmt: skip
 FROM_THE_EPHEMERIS = {"general_relativity", "polar_motion"}
 

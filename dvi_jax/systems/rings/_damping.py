@@ -86,9 +86,9 @@ def in_phase(ring: Ring, where: Where = "cavity") -> Ring:
     `where`: the cavities; others, such as harmonic ones, are not changed. **Raises** `ValueError`
     if the loss exceeds the voltage.
     """
-    cavities = ring.where(where)
+    cavities = ring.where(where).tolist()
     orbit = closed_orbit(ring, 0.0)
-    quiet = ring.set(_elements(ring, ("cavity",)), voltage=0.0)
+    quiet = ring.set(_elements(ring, ("cavity",)).tolist(), voltage=0.0)
     share = (orbit - one_turn(quiet, orbit))[5] / jnp.sum(ring.get(cavities, "voltage"))
     if not is_traced(share):
         hint = "Use cavities with a higher voltage."
