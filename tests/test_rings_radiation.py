@@ -138,14 +138,17 @@ def test_damping_and_integrals_agree():
 
 @pytest.mark.slow
 def test_gradient_of_the_emittance_agrees_with_differences():
+    """In a ring with fast damping: the matrix has the damping as a difference from 1, so that
+    differences of a ring with slow damping have a large error of rounding."""
+
     def emittances(k):
-        found = rings.equilibrium(radiating_cell().set("QF", b1=k))
+        found = rings.equilibrium(fast_ring().set("QF", b1=k))
         return jnp.stack([found.emittance[0], found.energy_spread, found.damping_time[0]])
 
-    _, gradient = jax.jvp(emittances, (1.3,), (1.0,))
-    step = 1e-5
-    difference = (emittances(1.3 + step) - emittances(1.3 - step)) / (2 * step)
-    assert close(gradient, difference, rel=1e-6)
+    _, gradient = jax.jvp(emittances, (1.4,), (1.0,))
+    step = 1e-4
+    difference = (emittances(1.4 + step) - emittances(1.4 - step)) / (2 * step)
+    assert close(gradient, difference, rel=1e-5)
     assert abs(gradient[0]) > 1e-10
 
 

@@ -62,7 +62,7 @@ def radiating(ring: Ring, where: Where | None = "*", mass: float = ELECTRON) -> 
         for name, value in values.items():
             columns[name] = jnp.zeros(len(ring)).at[numbers].set(value)
         parameters = tuple(p | {*names} if i in numbers else p for i, p in enumerate(parameters))
-    return _changed(ring, columns, parameters=parameters)
+    return _variant(ring, columns, parameters=parameters)
 
 
 def _elements(ring: Ring, names: tuple[str, ...]) -> np.ndarray:
@@ -70,7 +70,7 @@ def _elements(ring: Ring, names: tuple[str, ...]) -> np.ndarray:
     return np.unique([i for k, i in ring.program.rows if ring.program.parts[k].name in names])
 
 
-def _changed(ring: Ring, columns: dict[str, Array], **changes: Any) -> Ring:
+def _variant(ring: Ring, columns: dict[str, Array], **changes: Any) -> Ring:
     other = copy.copy(ring)
     program: RingStructure = dataclasses.replace(ring.program, **changes)
     object.__setattr__(other, "columns", columns)
@@ -86,10 +86,10 @@ def in_phase(ring: Ring, where: Where = "cavity") -> Ring:
     `where`: the cavities; others, such as harmonic ones, are not changed. **Raises** `ValueError`
     if the loss exceeds the voltage.
     """
-    cavities = ring.where(where)
+    cavities = ring.where(where).tolist()
     orbit = closed_orbit(ring, 0.0)
-    off = ring.set(_elements(ring, ("cavity",)), voltage=0.0)
-    share = (orbit - one_turn(off, orbit))[5] / jnp.sum(ring.get(cavities, "voltage"))
+    quiet = ring.set(_elements(ring, ("cavity",)).tolist(), voltage=0.0)
+    share = (orbit - one_turn(quiet, orbit))[5] / jnp.sum(ring.get(cavities, "voltage"))
     if not is_traced(share):
         hint = "Use cavities with a higher voltage."
         in_range("loss of a turn over the voltage of the cavities", share, 0.0, 1.0, hint)
@@ -127,12 +127,12 @@ def tapered(ring: Ring, where: Where = "*", rounds: int = 2) -> Ring:
             parts = *parts, *ends
         rows = []
         for i in range(len(ring)):
-            own = [row for row in program.rows if row[1] == i]
-            rows += [(first, i), *own, (first + 1, i)] if i in new else own
+            lines = [row for row in program.rows if row[1] == i]
+            rows += [(first, i), *lines, (first + 1, i)] if i in new else lines
         parameters = tuple(
             p | {"scale"} if i in new else p for i, p in enumerate(program.parameters)
         )
-        ring = _changed(ring, columns, parts=parts, rows=tuple(rows), parameters=parameters)
+        ring = _variant(ring, columns, parts=parts, rows=tuple(rows), parameters=parameters)
     return ring
 
 
@@ -156,8 +156,8 @@ def radiation_integrals(ring: Ring) -> Array:
     instance("ring", ring, Ring, "a rings.Ring")
     i = np.flatnonzero(["h" in p for p in ring.program.parameters])
     for frame, angle in FRAMES.items():
-        rolled = np.intersect1d(i, _elements(ring, (f"{frame}_in",)))
-        if len(rolled) and not is_traced(rolls := angle(ring.columns)[rolled]):
+        tilts = np.intersect1d(i, _elements(ring, (f"{frame}_in",)))
+        if len(tilts) and not is_traced(rolls := angle(ring.columns)[tilts]):
             hint = "The radiation integrals are those of a flat ring: use rings.equilibrium."
             in_range("roll of a bend", rolls, -0.01, 0.01, hint)
     o = optics(ring, 0.0, chromatic=False)

@@ -40,7 +40,7 @@ def _fly(ring: Ring, z: Array, epsilon: Array, words: Array, counts: tuple[int, 
     rows = {**passage.rows, "counter": jnp.asarray(np.cumsum(slices) - slices, float)}
 
     def forward(numbers, tables, z, epsilon, key):
-        line = Passage(*tables, numbers, passage.parts, key)
+        line = Passage(tables[0], tables[1], numbers, passage.parts, key)
 
         def one_turn(state, _):
             k, flight = state

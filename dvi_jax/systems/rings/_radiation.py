@@ -42,12 +42,12 @@ def radiant(kick: Kick) -> Callable[..., Particle]:
         if sign > 0:
             change = _lose(z, _rate(kick, z, length, par, part, noise), 1)
             return kick(z, length, par, part.order).plus(**change)
-        before, change = z, {"delta": 0.0}
+        origin, change = z, {"delta": 0.0}
         for _ in range(_ITERATIONS):
             start = z.plus(delta=change["delta"])
-            before = kick(start, -length, par, part.order)._replace(delta=z.delta)
-            change = _lose(before, _rate(kick, before, length, par, part, noise), -1)
-        return before.plus(**change)
+            origin = kick(start, -length, par, part.order)._replace(delta=z.delta)
+            change = _lose(origin, _rate(kick, origin, length, par, part, noise), -1)
+        return origin.plus(**change)
 
     return move
 
@@ -85,15 +85,15 @@ def _rate(kick: Kick, z: Particle, length: Any, par: Parameters, part: RingPart,
     p, wide = 1 + z.delta, 1 + h * z.x
     u, v = z.px / p, z.py / p
     # With this δ the terms of the reference orbit in the kick of a bend cancel.
-    pushed = kick(z._replace(px=0 * p, py=0 * p, delta=h * z.x), 1.0, par, part.order)
+    impulse = kick(z._replace(px=0 * p, py=0 * p, delta=h * z.x), 1.0, par, part.order)
     width = wide if part.name == "exact_bend" else 1.0
-    by, bx = h - pushed.px / width, pushed.py / width
+    vertical, radial = h - impulse.px / width, impulse.py / width
     if "exact" in part.name:
-        squares = bx * bx + by * by - (bx * u + by * v) ** 2
+        squares = radial**2 + vertical**2 - (radial * u + vertical * v) ** 2
         path = wide / jnp.sqrt(1 - u * u - v * v)
     else:
         slopes = u * u + v * v
-        squares = (bx * bx + by * by) * wide * wide + (bx * v - by * u) ** 2
+        squares = (radial**2 + vertical**2) * wide**2 + (radial * v - vertical * u) ** 2
         squares, path = squares / (wide * wide + slopes), wide + slopes / 2
     rate = par["loss"] * squares * path * length
     if noise is None:

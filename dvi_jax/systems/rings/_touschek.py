@@ -73,12 +73,12 @@ def touschek_lifetime(
     radius, sizes = RADIUS * ELECTRON / mass, jnp.asarray(emittance, float)[:2]
     beta, alpha, spread2 = o.beta[:-1], o.alpha[:-1], energy_spread**2
     D, slope = o.dispersion[:-1, ::2], o.dispersion[:-1, 1::2]
-    turned = D * alpha + slope * beta
+    rotation = D * alpha + slope * beta
     area = beta * sizes[None]  # σ² without dispersion
-    across = 1 / (1 / spread2 + jnp.sum((D**2 + turned**2) / area, 1))
-    b = beta**2 / area * (1 - across[:, None] * turned**2 / area) / (2 * gamma2)
-    mixed = across**2 * jnp.prod(beta * turned / area, 1) ** 2 / gamma2**2
-    B1, B2 = jnp.sum(b, 1), jnp.sqrt((b[:, 0] - b[:, 1]) ** 2 + mixed)
+    height = 1 / (1 / spread2 + jnp.sum((D**2 + rotation**2) / area, 1))
+    b = beta**2 / area * (1 - height[:, None] * rotation**2 / area) / (2 * gamma2)
+    coupling = height**2 * jnp.prod(beta * rotation / area, 1) ** 2 / gamma2**2
+    B1, B2 = jnp.sum(b, 1), jnp.sqrt((b[:, 0] - b[:, 1]) ** 2 + coupling)
     widths = jnp.prod(area + spread2 * D**2, 1) - spread2**2 * jnp.prod(D**2, 1)
     rates = jax.vmap(lambda tau: _integral(tau, B1, B2), 1, 1)(limits**2)
     factor = jnp.sqrt(jnp.pi * (B1**2 - B2**2)) / jnp.sqrt(widths)
