@@ -268,13 +268,13 @@ def frequency_map(
 # JAX would compile each operation for each shape; it is needed for what is traced only.
 
 
-def _in_numpy(x: Any) -> Any:
-    return x if is_traced(x) else np.asarray(x)
+def _in_numpy(array: Any) -> Any:
+    return array if is_traced(array) else np.asarray(array)
 
 
-def _module_of(x: Any) -> Any:
+def _module_of(array: Any) -> Any:
     """`jax.numpy` for what is traced, otherwise NumPy."""
-    return jnp if is_traced(x) else np
+    return jnp if is_traced(array) else np
 
 
 def _first_loss(survive: Callable, rays: int, steps: int, rounds: int) -> Any:
