@@ -183,7 +183,7 @@ def dynamic_aperture(
     in_range("largest", limits, 1e-9, 1.0, "The unit is m.")
     rays = np.stack([limits[0] * np.cos(angles), limits[1] * np.sin(angles)], 1)
     o, ring = optics(ring, dp, chromatic=False), ring if dp is None else four(ring)
-    orbit = _in_numpy(o.orbit)[0]
+    orbit = _in_numpy(o.orbit)[:1, None]
 
     def survive(r):
         z = (1e-6 + r[..., None] * rays[:, None]) @ _XY + orbit
@@ -227,7 +227,7 @@ def momentum_aperture(
     finish = jax.jit(jax.vmap(lambda z, first: lanewise.call(end_of_turn, passage, z, first)))
 
     def survive(r):
-        z = (r * side[:, None])[..., None] * np.eye(6)[5] + begins[:, None]
+        z = (r * side[:, None])[..., None] * np.eye(6)[None, 5:] + begins[:, None]
         begin = np.broadcast_to(first[:, None], r.shape)
         return _pieces(lambda z, i: ~track(ring, finish(z, i), turns).lost, progress, z, begin)
 
@@ -268,13 +268,13 @@ def frequency_map(
 # JAX would compile each operation for each shape; it is needed for what is traced only.
 
 
-def _in_numpy(x: Any) -> Any:
-    return x if is_traced(x) else np.asarray(x)
+def _in_numpy(array: Any) -> Any:
+    return array if is_traced(array) else np.asarray(array)
 
 
-def _module_of(x: Any) -> Any:
+def _module_of(array: Any) -> Any:
     """`jax.numpy` for what is traced, otherwise NumPy."""
-    return jnp if is_traced(x) else np
+    return jnp if is_traced(array) else np
 
 
 def _first_loss(survive: Callable, rays: int, steps: int, rounds: int) -> Any:

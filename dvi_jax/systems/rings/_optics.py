@@ -215,48 +215,48 @@ def maps(ring: Ring) -> tuple[Callable, Any, np.ndarray]:
 
 
 @functools.partial(jax.jit, static_argnames=("kinds", "chromatic"))
-def _passage(kinds: tuple[RingPart, ...], xs: Any, z: Array, D: Array, chromatic: bool):
-    """The orbit z and its derivative M after each piece, and the derivative of M at the end along D
+def _passage(kinds: tuple[RingPart, ...], xs: Any, orbit: Any, D: Any, chromatic: bool):
+    """The orbit and its derivative M after each piece, and the derivative of M at the end along D
     (NaN if not `chromatic`). A batch of directions of the derivative is one program."""
     apply = map_of(kinds)
 
-    def states(xs, z):
-        def row(z, x):
-            z = apply(z, x)
-            return z, jnp.stack(z)
+    def states(xs, orbit):
+        def row(particle, columns):
+            particle = apply(particle, columns)
+            return particle, jnp.stack(particle)
 
-        end, zs = lax.scan(row, Particle(*z), xs)
+        end, zs = lax.scan(row, Particle(*orbit), xs)
         return zs, jnp.stack(end)
 
-    def slopes(xs, v, z):
-        (zs, _), (of_zs, of_end) = jax.jvp(functools.partial(states, xs), (z,), (v,))
+    def slopes(xs, direction, orbit):
+        of_orbit = functools.partial(states, xs)
+        (zs, _), (of_zs, of_end) = jax.jvp(of_orbit, (orbit,), (direction,))
         return (of_zs, of_end), zs
 
-    def along(xs, z, D, v):
+    def derivatives(xs, orbit, change, direction):
+        of_orbit = functools.partial(slopes, xs, direction)
         if not chromatic:
-            (of_zs, _), zs = slopes(xs, v, z)
+            (of_zs, _), zs = of_orbit(orbit)
             return zs, of_zs, jnp.full(6, jnp.nan)
-        (of_zs, _), (_, of_end), zs = jax.jvp(
-            functools.partial(slopes, xs, v), (z,), (D,), has_aux=True
-        )
+        (of_zs, _), (_, of_end), zs = jax.jvp(of_orbit, (orbit,), (change,), has_aux=True)
         return zs, of_zs, of_end
 
     # Eight directions fill a register.
-    zs, Ms, dM = compiled(along, (None, None, None, 0), (xs, z, D, np.eye(8, 6)))
+    zs, Ms, dM = compiled(derivatives, (None, None, None, 0), (xs, orbit, D, np.eye(8, 6)))
     return zs[0], jnp.moveaxis(Ms[:6], 0, 2), dM[:6].T
 
 
 def analysis(
-    ring: Ring, z: Any, six: bool, chromatic: bool, by_part: bool = False
+    ring: Ring, start: Any, six: bool, chromatic: bool, by_part: bool = False
 ) -> tuple[Optics, Any]:
     """See `optics`; also the last correction of the closed orbit. `by_part`: before each piece of
     `pieces_in` and at the end, not at the elements (but for `s`)."""
-    if any(map(is_traced, jax.tree.leaves((ring, z)))):
-        return _compiled_analysis(ring, z, six, chromatic, by_part)
+    if any(map(is_traced, jax.tree.leaves((ring, start)))):
+        return _compiled_analysis(ring, start, six, chromatic, by_part)
     # In NumPy, so that little has to be compiled: nothing for a second ring of the same parts.
-    ring, z = jax.tree.map(np.asarray, (ring, z))
+    ring, start = jax.tree.map(np.asarray, (ring, start))
     with np.errstate(all="ignore"):
-        twiss, size = _analysis(np, ring, z, six, chromatic, by_part)
+        twiss, size = _analysis(np, ring, start, six, chromatic, by_part)
     return jax.device_put(twiss), size
 
 
@@ -335,12 +335,12 @@ def _analysis(xp: Any, ring: Ring, z: Any, six: bool, chromatic: bool, by_part: 
 _compiled_analysis = eqx.filter_jit(functools.partial(_analysis, jnp))
 
 
-def _solve(xp: Any, A: Any, b: Any) -> Any:
-    """The solution of A x = b; not finite for a singular A, for which NumPy raises an error."""
+def _solve(xp: Any, matrix: Any, right: Any) -> Any:
+    """The solution of a linear system; NaN for a singular one, for which NumPy raises an error."""
     try:
-        return xp.linalg.solve(A, b)
+        return xp.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:
-        return np.full(b.shape, np.nan)
+        return np.full(right.shape, np.nan)
 
 
 FRAMES: dict[str, Callable] = {

@@ -64,4 +64,8 @@ def padded(rows: Any, kinds: int, count: int) -> Any:
         return np.pad(column, ((0, extra), *[(0, 0)] * (column.ndim - 1)), constant_values=value)
 
     par, number, steps = rows
-    return {k: longer(column) for k, column in par.items()}, longer(number, kinds), longer(steps)
+    return (
+        {name: longer(column) for name, column in par.items()},
+        longer(number, kinds),
+        longer(steps),
+    )

@@ -90,7 +90,8 @@ def compiled(function: Callable, axes: Sequence[int | None], args: tuple) -> Any
     of the derivative.
     """
     operands, tree = jax.tree.flatten(args)
-    axes = [a for a, x in zip(axes, args, strict=True) for _ in jax.tree.leaves(x)]
+    pairs = zip(axes, args, strict=True)
+    axes = [axis for axis, value in pairs for _ in jax.tree.leaves(value)]
     trees: list[Any] = []
 
     def values(*operands):
@@ -99,23 +100,22 @@ def compiled(function: Callable, axes: Sequence[int | None], args: tuple) -> Any
         return out
 
     def rule(operands, changes):
-        moving = [i for i, c in changes.items() if c.dtype != jax.dtypes.float0]
-        vectors = [changes[i] for i in moving]
+        moving = [place for place, change in changes.items() if change.dtype != jax.dtypes.float0]
+        vectors = [changes[place] for place in moving]
 
         def change(operands, vectors):
             def of(*new):
                 point = dict(enumerate(operands)) | dict(zip(moving, new, strict=True))
                 return values(*point.values())
 
-            return jax.jvp(of, [operands[i] for i in moving], vectors)[1]
+            return jax.jvp(of, [operands[place] for place in moving], vectors)[1]
 
-        batch = axes, [axes[i] for i in moving]
+        batch = axes, [axes[place] for place in moving]
         definition = jax.vmap(change, batch)
 
         def pull(operands, cotangents):
-            return jax.linear_transpose(functools.partial(definition, operands), vectors)(
-                cotangents
-            )[0]
+            of_vectors = functools.partial(definition, operands)
+            return jax.linear_transpose(of_vectors, vectors)(cotangents)[0]
 
         push = jax.vmap(functools.partial(lanewise.call, change), batch)
         return linear_map(push, pull, definition, operands, vectors)
