@@ -118,7 +118,7 @@ def test_damping_and_integrals_agree():
     """Eigenvalues of the matrix and radiation integrals, whose formulas are the limit of small
     losses and slow synchrotron motion."""
     ring, found = radiating_cell(), equilibrium_of_cell()
-    _, i2, i3, i4, i5 = rings.radiation_integrals(ring)
+    _, i2, i3, i4, i5 = map(float, rings.radiation_integrals(ring))
     loss = 8.8462738e-5 * 2.8**4 * i2 / (2 * np.pi) * 1e9
     assert found.loss == pytest.approx(float(loss), rel=2e-4)
     partition = np.array([1 - i4 / i2, 1, 2 + i4 / i2])
