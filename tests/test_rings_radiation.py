@@ -114,6 +114,7 @@ def test_the_loss_cannot_exceed_the_voltage():
         rings.in_phase(rings.radiating(cell_of(2.8e9, 1e-6)))
 
 
+@pytest.mark.slow
 def test_damping_and_integrals_agree():
     """Eigenvalues of the matrix and radiation integrals, whose formulas are the limit of small
     losses and slow synchrotron motion."""
@@ -128,7 +129,7 @@ def test_damping_and_integrals_agree():
         float(jnp.sum(ring.period / found.damping_time)), rel=1e-10
     )
     c_q, gamma = 3.8319387e-13, 2.8e9 / 510998.95
-    assert found.emittance[0] == pytest.approx(c_q * gamma**2 * i5 / (i2 - i4), rel=5e-4)
+    assert close(found.emittance[0], c_q * gamma**2 * i5 / (i2 - i4), rel=1e-3)
     spread = gamma * np.sqrt(c_q * i3 / (2 * i2 + i4))
     assert found.energy_spread == pytest.approx(float(spread), rel=5e-4)
     assert found.emittance[1] < 1e-30
