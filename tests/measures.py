@@ -38,12 +38,12 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 17_116,
-    "lines of the questions": 22_460,
-    "lines of the leaves": 22_230,
-    "lines of lanewise": 12_700,
-    "lines of the command line": 5_651,
-    "raise statements": 666,
+    "lines of the core": 17_520,
+    "lines of the questions": 22_475,
+    "lines of the leaves": 25_480,
+    "lines of lanewise": 12_760,
+    "lines of the command line": 5_668,
+    "raise statements": 671,
     "characters of error text": 45_000,
     "functions with more than 9 parameters": 2,
     "files of more than 450 lines": 0,
