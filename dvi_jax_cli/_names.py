@@ -38,6 +38,7 @@ EXTRAS = {
     "explore": ("panel", "bokeh"),
     "ephemeris": ("jplephem", "skyfield_data"),
     "stellarator": ("qsc",),
+    "fields": ("interpax",),
     "rings": ("at",),
     "interop": ("astropy", "diffrax", "rebound", "scipy"),
 }

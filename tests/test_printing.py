@@ -78,7 +78,7 @@ OBJECTS = {
     "element": lambda: CELL[0],
     "observations": lambda: dvi.Observations(np.arange(900.0), np.ones((900, 2)), "positions"),
     "model": lambda: dvi.Model(systems.kepler().system, h=0.1, q0=np.ones(2), p0=np.ones(2)),
-    "tracked": lambda: rings.Tracked(np.ones((50, 6)), np.ones(50), np.ones(50), np.ones((50, 6))),
+    "tracked": lambda: rings.Tracked(*(np.ones(s) for s in ((50, 6), 50, 50, (50, 6), 50))),
     "optics": lambda: rings.Optics(*(jnp.ones((30, 6)) for _ in range(12))),
     "shell": lambda: dvi.starts.EnergyShell(9, lambda q, p: q @ q, 1.0, -np.ones(4), np.ones(4)),
     "map": lambda: rings.FrequencyMap(*(jnp.ones((9, 9, 2)) for _ in range(3))),
