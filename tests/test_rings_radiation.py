@@ -307,7 +307,8 @@ def test_gradient_of_damped_tracking_agrees_with_differences():
 
 @pytest.mark.slow
 def test_tapered_magnets_restore_the_orbit():
-    """The horizontal orbit with a cavity at one place, without and with tapering."""
+    """The horizontal orbit with a cavity at one place, without and with tapering. The loss within
+    each magnet remains, which bends the orbit inwards and shifts all momenta alike."""
     cell = cell_of(8e9, 0.01).program
     ring = rings.in_phase(rings.radiating(cell_of(8e9, 0.01)))
     orbit = jnp.max(jnp.abs(rings.optics(ring, chromatic=False).orbit[:, 0]))
@@ -318,7 +319,8 @@ def test_tapered_magnets_restore_the_orbit():
     assert jnp.max(jnp.abs(found[:, 0])) < 0.2 * orbit
     again = rings.tapered(tapered, rounds=1)
     assert again.program.rows == tapered.program.rows
-    assert close(again.columns["scale"], tapered.columns["scale"], abs=1e-8)
+    shift = (again.columns["scale"] - tapered.columns["scale"])[tapered.columns["scale"] != 1]
+    assert jnp.ptp(shift) < 5e-3 * jnp.abs(shift).max() < 1e-6
 
 
 @pytest.mark.slow

@@ -101,9 +101,10 @@ def tapered(ring: Ring, where: Where = "*", rounds: int = 2) -> Ring:
     """The ring whose magnets have fields in proportion to the local momentum 1 + δ of the closed
     orbit, so that the orbit is that of the ring without radiation, but for δ.
 
-    All fields of a magnet and its loss of energy are scaled, by the mean of δ at its ends.
-    `rounds`: how often the closed orbit is computed. pyAT's `tapering` does the same, except for a
-    factor (1 + δ)³ in the loss of energy in a magnet. **Raises** as `optics`.
+    All fields of a magnet and its loss of energy are scaled, by the mean of δ at its ends; the
+    change of δ within a magnet remains. `rounds`: how often the closed orbit is computed. pyAT's
+    `tapering` does the same, except for a factor (1 + δ)³ in the loss of energy in a magnet.
+    **Raises** as `optics`.
 
     A magnet has the new parameter `scale`.
     """
