@@ -466,7 +466,8 @@ class Generator:
                 *others,
             )
 
-        self.append(f"random cond {nodes}", function, [which, *others], "cond", nodes)
+        key = f"random cond {nodes} {[as_key(a) for a in avals]}"
+        self.append(key, function, [which, *others], "cond", nodes)
 
 
 def as_key(aval):
