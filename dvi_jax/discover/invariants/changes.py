@@ -211,7 +211,7 @@ def batched_changes(step_map: StepMap, order: int, samples):
         slopes = jax.jacfwd(lambda z: basis(*state(z)))(z)
         return basis(q, p, t), terms, volumes, end[3], slopes, z1 - z, blur
 
-    return lanewise.batched(at_point)(*samples)
+    return jax.vmap(at_point)(*samples)
 
 
 def terms_in_pairs(step_map: StepMap, order: int, samples: SamplePoints) -> Pair:
@@ -269,7 +269,7 @@ def is_exact(step_map: StepMap, series, sizes, samples):
             good = good & jnp.all(jnp.isfinite(end))
             return c @ start, c @ end - c @ start, rounding, good
 
-        start, change, rounding, good = lanewise.batched(value)(*map(jnp.asarray, samples))
+        start, change, rounding, good = jax.vmap(value)(*map(jnp.asarray, samples))
         size = jnp.minimum(_EXACT_STEPS * typical, 1) * jnp.std(start)
         limit = _EXACT * size + _EXACT_STEPS * jnp.finfo(start.dtype).eps * rounding
         return (jnp.mean(good) > 0.5) & jnp.all(~good | (jnp.abs(change) <= limit))
