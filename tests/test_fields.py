@@ -124,6 +124,9 @@ def test_coils_of_other_shapes_are_refused():
         fields.from_fourier(np.zeros((2, 2, 3)), np.zeros((2, 2, 3)), [1.0])
     with pytest.raises(ValueError, match="currents must be"):
         fields.Polylines(np.zeros((2, 4, 3)), [1.0])
+    for shapes, name in (((4, 3), (4, 3), 1), "points"), (((1, 4, 3), (1, 5, 3), 1), "tangents"):
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            fields.Filaments(*map(np.ones, shapes))
 
 
 def potential(q):
@@ -223,6 +226,8 @@ def test_a_grid_without_the_package_says_what_to_install(monkeypatch):
         fields.Spline([np.arange(4.0)] * 3, np.zeros((4, 4, 4)))
     with pytest.raises(ValueError, match="values must be"):
         fields.Spline([np.arange(4.0)] * 3, np.zeros((4, 4, 4, 2)))
+    with pytest.raises(ValueError, match="number of axes must be 3"):
+        fields.Spline([np.arange(4.0)] * 2, np.zeros((4, 4)))
     with pytest.raises(ValueError, match="axis y must be"):
         fields.Spline(
             [np.arange(4.0), -((np.arange(4.0) ** 2 - 2) ** 2), np.arange(4.0)], np.zeros((4, 4, 4))

@@ -142,7 +142,8 @@ class Operations(Finiteness):
 
         With r = 1/b and q = a·r, both rounded, and the exact error e = a − q·b, q + e·r rounds to
         the bits of a/b. But where e has lost digits, for numbers below 1e-290, or a/b is the
-        largest number, it may be its neighbour; and |b| below 5.6e-309 counts as 0.
+        largest number, it may be its neighbour; |b| counts as 0 below 5.6e-309, and as infinite
+        above 4.5e307.
 
         **Source** Markstein 1990, *IBM J. Res. Dev.* 34, 111; Brisebarre, Muller & Raina 2004,
         *IEEE Trans. Comput.* 53, 1069.

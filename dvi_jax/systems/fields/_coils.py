@@ -42,15 +42,22 @@ class Filaments(eqx.Module):
     All arrays are differentiable. Give the coils to H in `args`: the run is then differentiable
     with respect to them, too.
 
+    **Raises** `ValueError` for other shapes.
+
     **Accuracy** the error relative to that of the smooth curve decreases as exp(−n d/R), with n
     points of a coil of radius R at the distance d from it: close to a coil many points are needed.
 
     **Source** Jackson 1999, *Classical Electrodynamics*, 5.
     """
 
-    points: Float[Array, "coils points 3"]
-    tangents: Float[Array, "coils points 3"]
-    currents: Float[Array, " coils"]
+    points: Float[Array, "coils points 3"] = eqx.field(converter=jnp.asarray)
+    tangents: Float[Array, "coils points 3"] = eqx.field(converter=jnp.asarray)
+    currents: Float[Array, " coils"] = eqx.field(converter=jnp.asarray)
+
+    def __check_init__(self):
+        count = array("points", self.points, ("coils", "points", 3)).shape[:2]
+        array("tangents", self.tangents, (*count, 3))
+        array("currents", self.currents, count[:1])
 
     def vector_potential(self, q: Any) -> Array:
         """A [T m] at a position [m], both of shape (3,)."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ...base.checks import array, in_order, positive
+from ...base.checks import array, in_order, one_of, positive
 from ...base.printing import printable
 from ...fit.checks import package
 
@@ -49,6 +49,7 @@ class Spline(eqx.Module):
         self, axes: Sequence[Any], values: Any, *, cylindrical: bool = False, period: Any = None
     ):
         values, axes = jnp.asarray(values), [jnp.asarray(axis) for axis in axes]
+        one_of("number of axes", len(axes), (3,))
         for name, axis in zip("xyz", axes, strict=True):
             in_order(f"axis {name}", axis, strictly=True)
         shape = tuple(axis.size for axis in axes)
