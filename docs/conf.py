@@ -78,7 +78,7 @@ def _take_notebooks(app) -> None:
 
 def _find_notebooks(app, docname, source) -> None:
     """Links are written as a reader of the repository follows them."""
-    source[0] = source[0].replace("](../notebooks/", "](notebooks/")
+    source[0] = source[0].replace("](../notebooks/", "](notebooks/").replace("](../docs/", "](../")
 
 
 def setup(app) -> None:

@@ -176,14 +176,14 @@ def crossings(lengths, v_perp, phases, count, direction=1, h=0.2):
 
 lengths = np.array([3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0])
 speeds = np.linspace(0.2, 0.95, 16)
-points, _ = crossings(np.repeat(lengths, 16), np.tile(speeds, 8), np.full(128, 0.3), 150)
-points = points.reshape(8, 16, 150, 2)
+points, _ = crossings(np.repeat(lengths, 16), np.tile(speeds, 8), np.full(128, 0.3), 80)
+points = points.reshape(8, 16, 80, 2)
 with plot.style():
     figure, axes = plt.subplots(1, 4, figsize=(9.4, 2.7), dpi=90, sharey=True)
     for axis, i in zip(axes, (6, 3, 1, 0), strict=True):
         for k, orbit in enumerate(points[i]):
             both = np.concatenate([orbit, -orbit])  # the plane has two sides of the axis
-            axis.plot(*both.T, ".", ms=1.2, color=plt.cm.viridis(k / 16))
+            axis.plot(*both.T, ".", ms=1.2, color=plt.cm.viridis(k // 4 / 4))
         axis.set(xlabel="X/2", title=f"ρ/ℓ = 1/{lengths[i]:.0f}", aspect="equal")
     axes[0].set_ylabel("radial velocity")
 plt.show()

@@ -229,11 +229,15 @@ def _is_own(thing: Any) -> bool:
     return getattr(thing, "__module__", "").startswith(OWN)
 
 
+def _has_an_entry(cls: type) -> bool:
+    return getattr(dvi_jax, cls.__name__, None) is cls
+
+
 def _class_members(cls: type) -> Iterator[tuple[str, str, Any]]:
-    """(kind, name, thing) of documented public members, inherited ones of the package included."""
+    """(kind, name, thing) of documented public members: its own and those of private bases."""
     seen = set()
     for base in cls.__mro__:
-        if not _is_own(base):
+        if not _is_own(base) or (base is not cls and _has_an_entry(base)):
             continue
         for name, member in vars(base).items():
             if name.startswith("_") or name in seen:
@@ -272,6 +276,8 @@ def _entry(full: str, shown: str, thing: Any) -> str:
     lines = [f":::::{{py:{kind}}} {name}{arguments}", f":module: {module}", "", body, ""]
     lines += [usage.page().markdown(shown), ""]
     if kind == "class" and not table:
+        bases = [f"`{base.__name__}`" for base in thing.__mro__[1:] if _has_an_entry(base)]
+        lines += ["It has the members of " + " and ".join(bases) + ".", ""] if bases else []
         for what, member_name, member in _class_members(thing):
             extra = "" if what == "property" else signature(member)
             role = "method" if what == "classmethod" else what
