@@ -25,7 +25,16 @@ from ...base.inputs import real_numbers
 from ...base.types import Args, Scalar, State
 from ..flows import value_of
 from ..frames import Barycentric, Heliocentric, Jacobi
-from ._orbit import Delaunay, Equinoctial, Keplerian, ModifiedEquinoctial, Poincare, real_array
+from ._orbit import (
+    Delaunay,
+    Equinoctial,
+    Keplerian,
+    ModifiedEquinoctial,
+    Poincare,
+    broadcast,
+    program,
+    real_array,
+)
 
 Frame = Literal["jacobi", "heliocentric", "barycentric"]
 _FRAMES = {"jacobi": Jacobi, "heliocentric": Heliocentric, "barycentric": Barycentric}
@@ -63,7 +72,12 @@ def of_bodies(
     whole("the number of bodies", q.shape[-2], 2)
     all_masses, scale, G = _masses(masses, q.shape[-2], G)
     array("p", p, q.shape)
-    coordinates = _frame(frame)(all_masses)
+    return _of_kind(kind).from_state(*_orbits(_frame(frame)(all_masses), q, p, scale, G))
+
+
+@program
+def _orbits(coordinates: Any, q: Array, p: Array, scale: Array, G: Array) -> tuple[Array, ...]:
+    """Relative positions and velocities, and μ."""
     # Only the axis of the bodies is mixed; times and trajectories are before it.
     positions, velocities = (
         jnp.vectorize(function, signature="(n,d)->(n,d)")
@@ -71,7 +85,7 @@ def of_bodies(
     )
     v = p / jnp.broadcast_to(scale[:, None], p.shape)
     mu = jnp.broadcast_to(G * coordinates.central_mass(), (*q.shape[:-2], q.shape[-2] - 1))
-    return _of_kind(kind).from_state(positions(q)[..., 1:, :], velocities(v)[..., 1:, :], mu)
+    return positions(q)[..., 1:, :], velocities(v)[..., 1:, :], mu
 
 
 def to_bodies(
@@ -96,13 +110,18 @@ def to_bodies(
     ```
     """
     instance("elements", elements, (*_KINDS.values(),), "elements, such as dvi.elements.Keplerian")
-    elements = type(elements)(*jnp.broadcast_arrays(*map(jnp.asarray, elements)))
+    shape = jnp.broadcast_shapes(*map(jnp.shape, elements))
+    elements = type(elements)(*(broadcast(x, shape) for x in elements))
     array("the elements", elements[0], ("bodies − 1",), integers=True)
     all_masses, scale, G = _masses(masses, len(elements[0]) + 1, G)
     coordinates = _frame(frame)(all_masses)
+    return _states(coordinates, scale, *elements.state(G * coordinates.central_mass(), dim))
+
+
+@program
+def _states(coordinates: Any, scale: Array, q: Array, v: Array) -> tuple[Array, Array]:
     # Row 0 is the centre of mass, for positions and velocities.
-    state = elements.state(G * coordinates.central_mass(), dim)
-    X, V = (jnp.concatenate([jnp.zeros((1, dim)), x]) for x in state)
+    X, V = (jnp.concatenate([jnp.zeros((1, x.shape[-1])), x]) for x in (q, v))
     return coordinates.to_bodies(X), scale[:, None] * coordinates.velocities_back(V)
 
 
@@ -180,5 +199,5 @@ def _masses(masses: Any, bodies: int, G: Any) -> tuple[Array, Array, Any]:
         positive("G", G)
     # The momentum of a test particle would be 0 and determine no velocity.
     tests = bodies - whole("the number of masses", len(masses), 1, bodies)
-    all_masses = jnp.pad(masses, (0, tests))
+    all_masses = jnp.pad(masses, (0, tests)) if tests else masses
     return all_masses, jnp.where(all_masses == 0, 1.0, all_masses), G

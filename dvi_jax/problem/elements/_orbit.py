@@ -1,8 +1,15 @@
-"""Elements of one orbit, of five kinds."""
+"""Elements of one orbit, of five kinds.
 
+After the checks each conversion is one program: as many small ones, the first call would take
+seconds.
+"""
+
+import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -14,6 +21,24 @@ from ...base.checks import all_finite, array, in_range, one_of
 from ...base.inputs import real_numbers
 from ...engine.bracket import divide
 from .. import kepler as _kepler
+
+program = functools.partial(jax.jit, inline=True)
+
+
+def _of_state(compute: Callable) -> Any:
+    """The elements of a state. **Raises** `TypeError` for other than real numbers, `ValueError` for
+    another shape, or a known μ that is not positive."""
+    compiled: Any = program(compute, static_argnums=0)
+
+    @functools.wraps(compute)
+    def from_state(cls, q: Any, v: Any, mu: Any):
+        q, v, mu = _of_one_type({"q": q, "v": v, "mu": mu})
+        one_of("the last axis of q", q.shape[-1:], ((2,), (3,)))
+        array("v", v, q.shape)
+        _positive("mu", array("mu", mu, *{(), q.shape[:-1]}, empty=True))
+        return compiled(cls, q, v, mu)
+
+    return from_state
 
 
 class Keplerian(NamedTuple):
@@ -39,15 +64,17 @@ class Keplerian(NamedTuple):
     M: Array
 
     @classmethod
+    @_of_state
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        plane, mu = _plane(q, v, mu)
+        dim = q.shape[-1]
+        q, v, momentum = _plane(q, v)
         # Near the inclination π the orbit is turned about the x axis by π, to the inclination 0.
-        flips = plane.momentum[..., 2] < 0
+        flips = momentum[..., 2] < 0
         sign = jnp.where(flips, -1.0, 1.0)[..., None]
-        q, v = (jnp.concatenate([x[..., :1], sign * x[..., 1:]], -1) for x in (plane.q, plane.v))
+        q, v = (jnp.concatenate([x[..., :1], sign * x[..., 1:]], -1) for x in (q, v))
         a, ex, ey, hx, hy, longitude = Equinoctial.from_state(q, v, mu)
-        if plane.dim == 2:
+        if dim == 2:
             inc = node = jnp.zeros_like(a)
         else:
             inc, node = 2 * jnp.arctan(_length(hx, hy)), _angle(hx, hy)
@@ -55,7 +82,7 @@ class Keplerian(NamedTuple):
         # Near the circle M and ω have large errors of opposite sign. Far from it a (1 − e) and M
         # keep their digits near the pericentre if e and M belong to the energy.
         far = e > 0.1
-        e_far = jnp.sqrt(jnp.where(far, 1 - jnp.sum(plane.momentum**2, -1) / (mu * a), 1.0))
+        e_far = jnp.sqrt(jnp.where(far, 1 - jnp.sum(momentum**2, -1) / (mu * a), 1.0))
         M = jnp.where(far, _mean_anomaly(q, v, mu, e_far), _wrap(longitude - pericentre))
         e = jnp.where(far, e_far, e)
         return cls(
@@ -72,6 +99,11 @@ class Keplerian(NamedTuple):
         a, e, inc, node, pericentre, M, mu = _same_shape(self, mu)
         _in_range("e of elements.Keplerian", e, 0.0)
         _positive("a (1 − e) of elements.Keplerian", a * (1 - e), _AXIS)
+        return _of_dim(dim, *self._in_space(a, e, inc, node, pericentre, M, mu))
+
+    @staticmethod
+    @program
+    def _in_space(a, e, inc, node, pericentre, M, mu):
         time = jnp.where(a > 0, _wrap(M), M) * jnp.sqrt(jnp.abs(a) ** 3 / mu)
         # One orbit at a time: all together have one status, and one of them may be NaN.
         position = jnp.vectorize(_kepler.from_pericentre, signature="(),(),(),()->(d),(d),()")
@@ -83,7 +115,7 @@ class Keplerian(NamedTuple):
             y, z = jnp.cos(inc) * y, jnp.sin(inc) * y
             return jnp.where(good[..., None], jnp.stack([*_rotate(node, x, y), z], -1), jnp.nan)
 
-        return _of_dim(dim, in_space(q), in_space(v))
+        return in_space(q), in_space(v)
 
 
 class ModifiedEquinoctial(NamedTuple):
@@ -100,9 +132,10 @@ class ModifiedEquinoctial(NamedTuple):
     longitude: Array
 
     @classmethod
+    @_of_state
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        (q, v, momentum, _), mu = _plane(q, v, mu)
+        q, v, momentum = _plane(q, v)
         size = jnp.sqrt(jnp.sum(momentum**2, -1))
         w = momentum / size[..., None]
         hx, hy = (x / (1 + w[..., 2]) for x in (-w[..., 1], w[..., 0]))
@@ -117,14 +150,20 @@ class ModifiedEquinoctial(NamedTuple):
     def state(self, mu: Any, dim: int = 3) -> tuple[Array, Array]:
         """Position and velocity, of shape (…, dim)."""
         p, ex, ey, hx, hy, longitude, mu = _same_shape(self, mu)
-        cosine, sine = jnp.cos(longitude), jnp.sin(longitude)
-        r = p / (1 + ex * cosine + ey * sine)
         _positive("p of elements.ModifiedEquinoctial", p)
+        r, q, v = self._in_space(p, ex, ey, hx, hy, longitude, mu)
         _positive("p/(1 + e cos f)", r, "The longitude is beyond the asymptotes of the hyperbola.")
+        return _of_dim(dim, q, v)
+
+    @staticmethod
+    @program
+    def _in_space(p, ex, ey, hx, hy, longitude, mu):
+        cosine, sine = jnp.cos(longitude), jnp.sin(longitude)
+        r = distance = p / (1 + ex * cosine + ey * sine)
         speed = jnp.sqrt(jnp.where(r > 0, mu / p, jnp.nan))
         r = jnp.where(r > 0, r, jnp.nan)
         velocity = -speed * (sine + ey), speed * (cosine + ex)
-        return _in_space(dim, hx, hy, (r * cosine, r * sine), velocity)
+        return distance, *_in_space(hx, hy, (r * cosine, r * sine), velocity)
 
 
 class Equinoctial(NamedTuple):
@@ -138,9 +177,10 @@ class Equinoctial(NamedTuple):
     longitude: Array
 
     @classmethod
+    @_of_state
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        (q, v, *_), mu = _plane(q, v, mu)
+        q, v, _ = _plane(q, v)
         p, ex, ey, hx, hy, true_longitude = ModifiedEquinoctial.from_state(q, v, mu)
         r, rv, alpha = _energy(q, v, mu)
         x, y = r * jnp.cos(true_longitude), r * jnp.sin(true_longitude)
@@ -164,6 +204,11 @@ class Equinoctial(NamedTuple):
         a, ex, ey, hx, hy, longitude, mu = _same_shape(self, mu)
         e2 = ex * ex + ey * ey
         _positive("a (1 − e²) of elements.Equinoctial", a * (1 - e2), _AXIS)
+        return _of_dim(dim, *self._in_space(a, ex, ey, e2, hx, hy, longitude, mu))
+
+    @staticmethod
+    @program
+    def _in_space(a, ex, ey, e2, hx, hy, longitude, mu):
         is_small = e2 < 0.25
         # Near the circle the pericentre is undefined; far from it the other iteration is slow.
         small = jnp.where(is_small, ex, 0.0), jnp.where(is_small, ey, 0.0)
@@ -178,7 +223,7 @@ class Equinoctial(NamedTuple):
             return jnp.where(good, jnp.where(is_small, x, y), jnp.nan)
 
         q, v = (tuple(map(choose, *pair)) for pair in ((q_near, q_far), (v_near, v_far)))
-        return _in_space(dim, hx, hy, q, v)
+        return _in_space(hx, hy, q, v)
 
 
 class Delaunay(NamedTuple):
@@ -196,9 +241,10 @@ class Delaunay(NamedTuple):
     H: Array
 
     @classmethod
+    @_of_state
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        (q, v, momentum, _), mu = _plane(q, v, mu)
+        q, v, momentum = _plane(q, v)
         kepler = Keplerian.from_state(q, v, mu)
         # On a circle rounding may make G larger than L, and e the root of a negative number.
         L = _action(kepler.a, mu)
@@ -233,9 +279,10 @@ class Poincare(NamedTuple):
     p: Array
 
     @classmethod
+    @_of_state
     def from_state(cls, q: Any, v: Any, mu: Any) -> Self:
         """The elements of a state."""
-        (q, v, momentum, _), mu = _plane(q, v, mu)
+        q, v, momentum = _plane(q, v)
         a, ex, ey, hx, hy, longitude = Equinoctial.from_state(q, v, mu)
         action = _action(a, mu)
         G = jnp.sqrt(jnp.sum(momentum**2, -1))
@@ -257,26 +304,11 @@ class Poincare(NamedTuple):
         return Equinoctial(*elements).state(mu, dim)
 
 
-class _Plane(NamedTuple):
-    """A state in space, its angular momentum q × v for unit mass, and the dimension it came in."""
-
-    q: Array
-    v: Array
-    momentum: Array
-    dim: int
-
-
-def _plane(q: Any, v: Any, mu: Any) -> tuple[_Plane, Array]:
-    """**Raises** `TypeError` for other than real numbers, `ValueError` for another shape, or a
-    known μ that is not positive."""
-    q, v, mu = _of_one_type({"q": q, "v": v, "mu": mu})
-    one_of("the last axis of q", q.shape[-1:], ((2,), (3,)))
-    array("v", v, q.shape)
-    _positive("mu", array("mu", mu, *{(), q.shape[:-1]}, empty=True))
-    dim = q.shape[-1]
-    if dim == 2:
+def _plane(q: Array, v: Array) -> tuple[Array, Array, Array]:
+    """A state in space, and its angular momentum q × v for unit mass."""
+    if q.shape[-1] == 2:
         q, v = (jnp.concatenate([x, jnp.zeros_like(x[..., :1])], -1) for x in (q, v))
-    return _Plane(q, v, jnp.cross(q, v), dim), mu
+    return q, v, jnp.cross(q, v)
 
 
 _AXIS = "Ellipses have e < 1 and a > 0, hyperbolas e > 1 and a < 0; e = 1 is a ModifiedEquinoctial."
@@ -303,19 +335,19 @@ def _axes(hx: Array, hy: Array) -> tuple[Array, Array]:
     return scale * jnp.stack(first, -1), scale * jnp.stack(second, -1)
 
 
-def _in_space(dim: int, hx: Array, hy: Array, *vectors: Any) -> tuple[Array, Array]:
+def _in_space(hx: Array, hy: Array, *vectors: Any) -> tuple[Array, ...]:
     """Vectors (x, y) in the orbit's plane, as vectors in space."""
     first, second = _axes(hx, hy)
-    return _of_dim(dim, *(x[..., None] * first + y[..., None] * second for x, y in vectors))
+    return tuple(x[..., None] * first + y[..., None] * second for x, y in vectors)
 
 
 def _of_dim(dim: int, q: Array, v: Array) -> tuple[Array, Array]:
-    one_of("dim", dim, (2, 3))
-    if dim == 2:
-        for x in (q, v):
-            tilt = x[..., 2] / jnp.sqrt(jnp.sum(x * x, -1))
-            _in_range("z/r with dim=2", tilt, -1e-9, 1e-9, "The inclination must be 0 or π.")
-    return q[..., :dim], v[..., :dim]
+    if one_of("dim", dim, (2, 3)) == 3:
+        return q, v
+    for x in (q, v):
+        tilt = x[..., 2] / jnp.sqrt(jnp.sum(x * x, -1))
+        _in_range("z/r with dim=2", tilt, -1e-9, 1e-9, "The inclination must be 0 or π.")
+    return q[..., :2], v[..., :2]
 
 
 def _near_circle(a: Array, ex: Array, ey: Array, longitude: Array, mu: Array) -> Any:
@@ -386,25 +418,33 @@ def _same_shape(elements: Any, mu: Any) -> list[Array]:
     """The elements and μ as arrays of one shape. **Raises** errors as `_plane` does."""
     label = f"of elements.{type(elements).__name__}"
     names = [*(f"{name} {label}" for name in elements._fields), "mu"]
-    arrays = _of_one_type(dict(zip(names, (*elements, mu), strict=True)))
+    arrays, shape = _of_one_type(dict(zip(names, (*elements, mu), strict=True))), ()
     _positive("mu", arrays[-1])
-    shape: tuple[int, ...] = ()
     for name, x in zip(names, arrays, strict=True):
         # Axes of length 1 are repeated, as in NumPy.
         pairs = zip(shape[::-1], x.shape[::-1], strict=False)
         array(name, x, x.shape if all(n == m or 1 in (n, m) for n, m in pairs) else shape)
         shape = np.broadcast_shapes(shape, x.shape)
-    return [jnp.broadcast_to(x, shape) for x in arrays]
+    return [broadcast(x, shape) for x in arrays]
+
+
+def broadcast(value: Any, shape: tuple[int, ...]) -> Any:
+    return value if np.shape(value) == shape else _module(value).broadcast_to(value, shape)
 
 
 def _of_one_type(values: dict[str, Any]) -> list[Array]:
     arrays = [x if isinstance(x, float) else real_array(name, x) for name, x in values.items()]
     dtype = jnp.result_type(*arrays, 0.0)
-    return [jnp.asarray(x, dtype) for x in arrays]
+    return [_module(x).asarray(x, dtype) for x in arrays]
 
 
 def real_array(name: str, value: Any) -> Array:
     """An array of a floating-point type. **Raises** `TypeError` for other than real numbers."""
     real_numbers(name, value)
-    entries = jnp.asarray(value)
-    return entries.astype(jnp.result_type(entries, 0.0))
+    value = value if isinstance(value, np.ndarray) else jnp.asarray(value)
+    return _module(value).asarray(value, jnp.result_type(value, 0.0))
+
+
+def _module(value: Any) -> Any:
+    """NumPy for its own arrays, which stay on the host; JAX for others."""
+    return np if isinstance(value, float | np.ndarray) else jnp
