@@ -2,7 +2,7 @@
 
 import functools
 import warnings
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -141,9 +141,8 @@ class WisdomHolman(SplittingMethod):
 
     def check(self, equations, first_interval, q, p):
         interval = first_interval()
-        frame, scale = self._frame(equations, interval, q)
-        masses = np.asarray(frame.masses)
-        v = np.asarray(equations.position_rate(interval, q, p))
+        start = jax.tree.map(np.asarray, _start(self, equations, interval, q, p))
+        masses, scale, v = start.masses, start.scale, start.v
         rtol = 1e5 * float(jnp.finfo(q.dtype).eps)
         if not (scale > 0).all() or not np.allclose(scale * v, p, rtol=rtol, atol=0):
             raise ValueError(
@@ -151,7 +150,7 @@ class WisdomHolman(SplittingMethod):
                 f"at the initial state with m = {scale[:, 0]}."
             )
         massive = _massive(equations.args, len(q))
-        if np.any(np.asarray(_conservative_force(equations, interval, q, p))[massive:]):
+        if np.any(start.force[massive:]):
             raise ValueError(
                 f"dvi.WisdomHolman takes bodies without an entry in masses of args for test "
                 f"particles of mass 0, here those after the first {massive}. They must not enter "
@@ -162,18 +161,13 @@ class WisdomHolman(SplittingMethod):
                 f"dvi.WisdomHolman requires the dominant body first, but body {masses.argmax()} "
                 f"has the mass {masses.max():g} and body 0 only {masses[0]:g}."
             )
-        self._check_steps(equations, interval, q, p)
+        self._check_steps(interval, start.X[1:], start.V[1:], start.mu)
         if self._switches and len(q) > 2:
             self._check_attraction(equations, interval, *equations.absolute(q, p), scale)
 
-    def _check_steps(self, equations, interval, q, p):
+    def _check_steps(self, interval, X, V, mu):
         """Warn of too few evaluations of the interaction in a revolution, or at a pericentre."""
-        frame, scale = self._frame(equations, interval, q)
-        position, momentum = equations.absolute(q, p)
-        X = np.asarray(frame.from_bodies(position), float)[1:]
-        V = np.asarray(frame.velocities_of(momentum / scale), float)[1:]
-        mu = np.asarray(self._strength(equations, q) * frame.central_mass(), float)
-        # From known numbers, once before a run: nothing of this is compiled.
+        X, V, mu = (np.asarray(x, float) for x in (X, V, mu))
         r2, v2, rv = (X * X).sum(axis=1), (V * V).sum(axis=1), (X * V).sum(axis=1)
         momentum = np.sqrt(np.maximum(r2 * v2 - rv * rv, 0))
         with np.errstate(all="ignore"):
@@ -408,9 +402,30 @@ class WisdomHolman(SplittingMethod):
         return self.compose(equations, interval, q, p, stages)
 
 
-def _conservative_force(equations: Equations, interval: Interval, q: State, p: State) -> Array:
-    point = (*interval[:2], *equations.absolute(q, p), equations.epsilon, equations.args)
-    return jax.grad(equations.system.hamiltonian, argnums=2)(*point)
+class _Start(NamedTuple):
+    """What is checked at the initial state: of the bodies, and in the coordinates X, V."""
+
+    masses: Array
+    scale: Array
+    v: Array
+    force: Array
+    X: Array
+    V: Array
+    mu: Array
+
+
+@eqx.filter_jit
+def _start(method: WisdomHolman, equations: Equations, interval: Interval, q: State, p: State):
+    # One program: as some fifty small ones, it would take the seconds of the first call.
+    frame, scale = method._frame(equations, interval, q)
+    position, momentum = equations.absolute(q, p)
+    point = (*interval[:2], position, momentum, equations.epsilon, equations.args)
+    return _Start(
+        frame.masses, scale, equations.position_rate(interval, q, p),
+        jax.grad(equations.system.hamiltonian, argnums=2)(*point),
+        frame.from_bodies(position), frame.velocities_of(momentum / scale),
+        method._strength(equations, q) * frame.central_mass(),
+    )  # fmt: skip
 
 
 def _massive(args: Args, bodies: int) -> int:

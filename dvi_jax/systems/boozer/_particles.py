@@ -158,7 +158,8 @@ class GuidingCentres(eqx.Module):
         s, theta, zeta, pitch = jnp.broadcast_arrays(
             *(jnp.asarray(values, jnp.result_type(float)) for values in (s, theta, zeta, pitch))
         )
-        return self.state(s, theta, zeta, pitch)
+        q, p, mu = _state(self, s, theta, zeta, pitch)
+        return q, p, self.args(mu)
 
     def state(self, s: Any, theta: Any, zeta: Any, pitch: Any) -> tuple[Array, Array, dict]:
         """`start` without checks, for traced arrays of one shape."""
@@ -179,12 +180,7 @@ class GuidingCentres(eqx.Module):
         """
         self._require(epsilon)
 
-        @functools.partial(jnp.vectorize, signature="(n),(n)->(),(),(),(),()")
-        def coordinates(q, p):
-            centre = centre_of(self.chart, q, p, self.args(0.0), epsilon)
-            return *centre[:3], self.speed * centre.u, centre.B
-
-        return Coordinates(*coordinates(jnp.asarray(q), jnp.asarray(p)))
+        return _coordinates(self, jnp.asarray(q), jnp.asarray(p), epsilon)
 
     def second_invariant(self, q: Any, p: Any, args: Any, epsilon: Any = None) -> Array:
         """J∥ = ∮ v∥ dl [m] of one state, in the well of |B| where it lies; NaN for a passing
@@ -250,6 +246,23 @@ class GuidingCentres(eqx.Module):
         """Ends a run where the guiding centre reaches s, which may be a wall beyond the plasma:
         for s > 1 the polynomials of the field are continued, whose error grows quickly."""
         return Stop(_Edge(self.chart, positive("s", s)))
+
+
+# Each of these is one program: as many small ones, it would take seconds.
+@eqx.filter_jit
+def _state(particles: GuidingCentres, *start: Array) -> tuple[Array, Array, Array]:
+    q, p, args = particles.state(*start)
+    return q, p, args["mu"]
+
+
+@eqx.filter_jit
+def _coordinates(particles: GuidingCentres, q: Array, p: Array, epsilon: Any) -> Coordinates:
+    @functools.partial(jnp.vectorize, signature="(n),(n)->(),(),(),(),()")
+    def coordinates(q, p):
+        centre = centre_of(particles.chart, q, p, particles.args(0.0), epsilon)
+        return *centre[:3], particles.speed * centre.u, centre.B
+
+    return Coordinates(*coordinates(q, p))
 
 
 class _Edge(eqx.Module):
