@@ -9,6 +9,7 @@ in units of m, v0 and 1 m, so that J∥ is a length.
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -106,13 +107,17 @@ def _end(line: _Line, zeta: Array, direction: float, turns: float) -> tuple[Arra
     return bracketed_root(line.parallel, a, previous, b, ahead, exists), exists
 
 
-def _well(field: Field, point: Any, mu: Any, energy: Any, turns: float) -> tuple[Any, ...]:
-    """The field line through a point (s, θ, ζ), the ends of the well, and whether it has both."""
+def _parameters(field: Field, *point: Any, turns: float) -> tuple[Any, ...]:
+    """The arguments of `well`, checked and of one type."""
     instance("field", field, Field, "a Field, such as boozer.precise_qa()")
     positive("turns", turns)
     if not is_traced(point[0]):
         in_range("s", point[0], 0.0, 1.0)
-    s, theta, zeta, mu, energy = (jnp.asarray(x, float) for x in (*point, mu, energy))
+    return field, *(jnp.asarray(x, float) for x in (*point, turns))
+
+
+def _well(field, s, theta, zeta, mu, energy, turns) -> tuple[Any, ...]:
+    """The field line through a point (s, θ, ζ), the ends of the well, and whether it has both."""
     line = _Line(field, s, theta - polynomial(field.iota, s) * zeta, mu, energy)
     low, has_low = _end(line, zeta, -1.0, turns)
     high, has_high = _end(line, zeta, 1.0, turns)
@@ -128,8 +133,14 @@ def well(
     amplitude; then by false position to the last digit. **Arguments and errors**: as for
     `second_invariant`. **Returns** a `Well`, in scalars.
     """
-    _, low, high, exists = _well(field, (s, theta, zeta), mu, energy, turns)
-    return Well(*(jnp.where(exists, end, jnp.nan) for end in (low, high)))
+    return Well(*_ends(*_parameters(field, s, theta, zeta, mu, energy, turns=turns)))
+
+
+# One program, and the next one: as many small ones they would take seconds in every call.
+@eqx.filter_jit
+def _ends(*parameters: Any) -> list[Array]:
+    _, low, high, exists = _well(*parameters)
+    return [jnp.where(exists, end, jnp.nan) for end in (low, high)]
 
 
 def second_invariant(
@@ -162,7 +173,12 @@ def second_invariant(
     **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3; in Boozer coordinates
     Helander 2014, *Rep. Prog. Phys.* 77, 087001, 4.3.
     """
-    line, low, high, exists = _well(field, (s, theta, zeta), mu, energy, turns)
+    return _invariant(*_parameters(field, s, theta, zeta, mu, energy, turns=turns))
+
+
+@eqx.filter_jit
+def _invariant(*parameters: Any) -> Array:
+    line, low, high, exists = _well(*parameters)
     coarse, is_resolved = _integral(line, low, high, 1)
     J, is_resolved = lax.cond(
         exists & ~is_resolved,
@@ -242,13 +258,17 @@ class SecondInvariant(eqx.Module):
 
     def value(self, q: Any, p: Any, args: Any) -> Array:
         """J∥ of one state [m]."""
-        centre = centre_of(self.chart, q, p, args, self.epsilon)
-        field = complete(args, self.epsilon)
-        point = centre.s, centre.theta, centre.zeta
-        return second_invariant(field, *point, args["mu"], centre.energy)
+        return _value(self, q, p, args)
 
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         return self.value(q1, p1, args)
+
+
+@eqx.filter_jit
+def _value(observable: SecondInvariant, q: Array, p: Array, args: Any) -> Array:
+    centre = centre_of(observable.chart, q, p, args, observable.epsilon)
+    field, point = complete(args, observable.epsilon), (centre.s, centre.theta, centre.zeta)
+    return second_invariant(field, *point, args["mu"], centre.energy)
 
 
 class Pitch(eqx.Module):
@@ -262,4 +282,4 @@ class Pitch(eqx.Module):
 
 def at_crossings(observable: SecondInvariant, crossings: Any, args: Any) -> Array:
     """J∥ of recorded crossings of one orbit; NaN after the last one."""
-    return jax.vmap(lambda q, p: observable.value(q, p, args))(crossings.qs, crossings.ps)
+    return jax.vmap(partial(_value, observable), (0, 0, None))(crossings.qs, crossings.ps, args)
