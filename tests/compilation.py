@@ -1,6 +1,8 @@
 """How the tests compile: flags of XLA, set before JAX starts."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 
 HAS_BOTH_EMITTERS = tuple(int(part) for part in version("jaxlib").split(".")[:2]) < (0, 11)
@@ -28,3 +30,26 @@ def flags_of_users() -> str:
 
 AS_FOR_USERS = {"xla_cpu_use_fusion_emitters": True} if HAS_BOTH_EMITTERS else {}
 """`compiler_options` of a `jit` whose results are compared bit by bit with those of another one."""
+
+
+_OPEN: list[list[str]] = []
+"""The lists of `programs_of_xla`, after one that is never read."""
+
+
+def _listen(event: str, seconds: float, **_) -> None:
+    if event.endswith("backend_compile_duration"):
+        for programs in _OPEN[1:]:
+            programs.append(event)
+
+
+@contextmanager
+def programs_of_xla() -> Iterator[list[str]]:
+    """A list that gets an entry for each program that XLA compiles inside."""
+    import jax  # after the flags
+
+    if not _OPEN:
+        jax.monitoring.register_event_duration_secs_listener(_listen)
+        _OPEN.append([])
+    _OPEN.append([])
+    yield _OPEN[-1]
+    _OPEN.pop()

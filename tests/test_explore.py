@@ -1,7 +1,6 @@
 """The pictures of the explorer as numbers: what they show, what they compile, what is copied."""
 
 import time
-from contextlib import contextmanager
 from dataclasses import replace
 
 import cli
@@ -9,26 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilation import programs_of_xla
 
 import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax.explorer import copies
 from dvi_jax.explorer.model import Model
 from dvi_jax.explorer.subject import METHODS, Subject, with_leaf
-
-PROGRAMS = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, duration, **kwargs: (
-        PROGRAMS.append(event) if event.endswith("backend_compile_duration") else None
-    )
-)
-
-
-@contextmanager
-def compiled():
-    """The number of programs that are compiled inside, as the length of a list."""
-    PROGRAMS.clear()
-    yield PROGRAMS
 
 
 def model(name="henon_heiles", **start):
@@ -58,7 +44,7 @@ def initial(heiles):
 
 
 def test_sliders_compile_nothing(heiles):
-    with compiled() as programs:
+    with programs_of_xla() as programs:
         for key, value in (("h", 0.09), ("q0[1]", 0.12), ("p0[0]", 0.3)):
             heiles.move(key, value)
             assert heiles.motion().message == ""
@@ -66,14 +52,14 @@ def test_sliders_compile_nothing(heiles):
     kepler = model("kepler")
     kepler.change(steps=1000)
     first = kepler.motion()
-    with compiled() as programs:
+    with programs_of_xla() as programs:
         kepler.move("epsilon", 0.01)
         kepler.move("args.K", 1.01)
         moved = kepler.motion()
     assert programs == []
     assert not np.array_equal(first.paths[""][0], moved.paths[""][0])
     kepler.change(steps=999)  # the control: another number of steps is another program
-    with compiled() as programs:
+    with programs_of_xla() as programs:
         kepler.motion()
     assert programs != []
 
@@ -173,7 +159,7 @@ def test_section_and_its_copy(heiles):
     picture = heiles.section()
     assert picture.message == ""
     assert picture.x.shape == (3, 400)
-    with compiled() as programs:
+    with programs_of_xla() as programs:
         heiles.move("h", 0.09)
         heiles.move("value", 0.01)
         for k in range(8):  # more orbits than one batch has
@@ -204,7 +190,7 @@ def test_diagram_and_its_copy():
     assert drawn.parameter[-1] == 0.4
     assert np.isfinite(drawn.y).any()
     np.testing.assert_allclose(drawn.y, names["diagram"].qs[..., 0], rtol=0, atol=1e-8)
-    with compiled() as programs:
+    with programs_of_xla() as programs:
         page.change(ends=(0.0, 0.2))
         page.move("h", page.settings.h * 0.9)
         page.diagram()

@@ -163,7 +163,15 @@ class WisdomHolman(SplittingMethod):
             )
         self._check_steps(interval, start.X[1:], start.V[1:], start.mu)
         if self._switches and len(q) > 2:
-            self._check_attraction(equations, interval, *equations.absolute(q, p), scale)
+            position, momentum = equations.absolute(q, p)
+            values = _attraction(self, equations, interval, position, momentum, scale)
+            size, of_first, difference = map(float, values)
+            # Where the attraction is so small that the first body hides it, it is not compared.
+            if size > 100 * of_first and difference > 0.1 * size:
+                raise ValueError(
+                    "encounters of dvi.WisdomHolman requires bodies that attract one another by "
+                    "Newton's law with the masses and G of the Kepler orbits, but they do not."
+                )
 
     def _check_steps(self, interval, X, V, mu):
         """Warn of too few evaluations of the interaction in a revolution, or at a pericentre."""
@@ -286,24 +294,6 @@ class WisdomHolman(SplittingMethod):
         # G m of each body, from μ of its orbit: G may be a function of the user.
         masses = frame.masses[1:] / frame.masses[0] * mu
         return Encounters(masses, mu, softening * softening, close)
-
-    def _check_attraction(self, equations, interval, q, p, scale):
-        """**Raises** `ValueError` if bodies next to one another do not attract by Newton's law."""
-        numbers, unit = np.arange(len(q) - 1), np.linalg.norm(np.asarray(q[1] - q[0]))
-        # All of them next to the second body, where their attraction exceeds that of the first one.
-        x = np.array(q)
-        x[1:] = x[1] + 1e-6 * unit * numbers[:, None]
-        x = jnp.asarray(x)
-        pairs = self._pairs(equations, interval, x, ~jnp.eye(len(numbers), dtype=bool))
-        pull = np.asarray(pairs.pull(x[1:, None] - x[None, 1:]))
-        difference = np.asarray(equations.momentum_rate(interval, x, p) / scale)[1:] - pull
-        size, of_first = np.abs(pull).max(), float(pairs.mu[0]) / unit**2
-        # Where the attraction is so small that the first body hides it, it is not compared.
-        if size > 100 * of_first and np.abs(difference).max() > 0.1 * size:
-            raise ValueError(
-                "encounters of dvi.WisdomHolman requires bodies that attract one another by "
-                "Newton's law with the masses and G of the Kepler orbits, but they do not."
-            )
 
     def _close(self, equations: Equations, interval: Interval, q: State, p: State) -> Array:
         """The pairs of bodies that are close at a state in these coordinates, and on the diagonal
@@ -436,3 +426,16 @@ def _massive(args: Args, bodies: int) -> int:
 
 def _gravity(args: Args) -> Any:
     return args.get("G", 1.0) if isinstance(args, dict) else 1.0
+
+
+@eqx.filter_jit
+def _attraction(method: WisdomHolman, equations: Equations, interval, q, p, scale):
+    """Of bodies next to one another: their attraction by Newton's law, that of the first body, and
+    by how much the acceleration differs from the former."""
+    numbers, unit = np.arange(len(q) - 1), jnp.linalg.norm(q[1] - q[0])
+    # All of them next to the second body, where their attraction exceeds that of the first one.
+    x = q.at[1:].set(q[1:2] + 1e-6 * unit * numbers[:, None])
+    pairs = method._pairs(equations, interval, x, ~jnp.eye(len(numbers), dtype=bool))
+    pull = pairs.pull(x[1:, None] - x[None, 1:])
+    difference = (equations.momentum_rate(interval, x, p) / scale)[1:] - pull
+    return jnp.abs(pull).max(), pairs.mu[0] / unit**2, jnp.abs(difference).max()
