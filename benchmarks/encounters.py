@@ -216,8 +216,8 @@ def picture(path):
             ax.axvspan(ts[k], ts[k + 1], color="C2" if repeated[k] else "C1", alpha=0.25, lw=0)
     axes[0].set_ylabel("between the planets [au]")
     axes[1].set(ylabel="|ΔE/E|", xlabel="t [year/2π]")
-    for ax in axes:
-        ax.legend(loc="center right", fontsize="small")
+    for ax, place in zip(axes, ("lower right", "center right"), strict=True):
+        ax.legend(loc=place, fontsize="small")
     figure.savefig(path, dpi=110)
     print(f"{close.sum()} steps with a close pair, {repeated.sum()} of them repeated")
 

@@ -16,7 +16,7 @@ from dvi_jax_cli.work.table import TomlTable
 ROOT = Path(dvi.__file__).parent.parent
 EXAMPLES = ROOT / "examples"
 MAIN = "from dvi_jax_cli import main; main()"
-ELSEWHERE = ("state", "args", "t0", "lattice", "plots", "ring")
+ELSEWHERE = ("state", "args", "t0", "lattice", "plots", "ring", "force")
 """Keys that one example shows for all kinds of files."""
 
 

@@ -14,6 +14,7 @@ from dvi_jax.methods._schemes import corrector, near_integrable, sequence_of
 from dvi_jax.problem import flows
 from dvi_jax.problem.kepler import change
 from dvi_jax.systems.n_body import hamiltonian
+from lanewise.jaxprs.extent import operation_count
 
 Q0, P0 = np.array([1.0, 0.0]), np.array([0.2, 1.1])
 
@@ -88,17 +89,46 @@ def test_kepler_flow_agrees_with_kepler_equation():
 
 @pytest.mark.slow
 def test_derivative_of_kepler_flow_on_both_sides_of_a_parabola():
-    def final(x):
-        dq, dv, _ = change(x[0], x[None, 1:3], x[None, 3:5], x[5:])
-        return jnp.concatenate([dq[0], dv[0]])
-
-    derivative = jax.jit(jax.jacfwd(final))
+    derivative = jax.jit(jax.jacfwd(kepler_flow))
     for speed in (0.9, np.sqrt(2.0), 1.9):
         x = jnp.array([2.5, 1.0, 0.1, -0.2, speed, 1.0])
         for i in range(6):
             ours = derivative(x)[:, i]
-            other = central_difference(jax.jit(final), x, jnp.eye(6)[i], step=1e-4)
+            other = central_difference(jax.jit(kepler_flow), x, jnp.eye(6)[i], step=1e-4)
             assert np.abs(ours - other).max() < 2e-10 * max(1, np.abs(ours).max())
+
+
+def kepler_flow(x):
+    """The flow over the time x[0] from (q, v) = (x[1:3], x[3:5]) with μ = x[5]."""
+    dq, dv, _ = change(x[0], x[None, 1:3], x[None, 3:5], x[5:])
+    return jnp.concatenate([dq[0], dv[0]])
+
+
+def test_the_derivative_of_kepler_flow_is_a_short_program():
+    """The search for the root and the sums of its functions are not differentiated."""
+    x = jnp.array([0.1, 1.0, 0.1, -0.2, 1.0, 1.0])
+    plain = operation_count(jax.make_jaxpr(kepler_flow)(x).jaxpr)
+    both = operation_count(jax.make_jaxpr(lambda x: jax.jvp(kepler_flow, (x,), (x,)))(x).jaxpr)
+    assert both < 1.5 * plain
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("time", [0.1, 5.0])
+def test_second_derivatives_of_kepler_flow(time):
+    """In ellipses and hyperbolas, by series and by trigonometric functions."""
+    first = jax.jit(jax.jacfwd(kepler_flow))
+    second, by_reverse = (
+        jax.jit(jax.jacfwd(jax.jacrev(kepler_flow))),
+        jax.jit(jax.jacrev(kepler_flow)),
+    )
+    for speed in (0.9, 1.9):
+        x = jnp.array([time, 1.0, 0.1, -0.2, speed, 1.0])
+        scale = np.abs(first(x)).max()
+        np.testing.assert_allclose(first(x), by_reverse(x), rtol=0, atol=1e-14 * scale)
+        ours = second(x)
+        for i in range(6):
+            other = central_difference(first, x, jnp.eye(6)[i], step=1e-4)
+            np.testing.assert_allclose(ours[..., i], other, rtol=0, atol=1e-8 * np.abs(ours).max())
 
 
 def test_a_body_at_the_centre_fails_and_does_not_affect_the_others():

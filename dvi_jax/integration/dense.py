@@ -61,15 +61,17 @@ class Curve(eqx.Module):
 
     def where(self, g: Callable[..., Any], start: StepStart, exists: Array) -> PointAndStatus:
         """The point of the step where g(t, q, p, args) = 0, or its end if none `exists`."""
-        args = self.equations.args
 
-        def value(theta):
-            point, _ = self.point(start, theta)
-            return event(g, *point, args)
+        def value(theta, curve=self, start=start):
+            point, _ = curve.point(start, theta)
+            return event(g, *point, curve.equations.args)
 
         zero, unit = jnp.zeros_like(start.t0), jnp.ones_like(start.t0)
-        at_zero = event(g, start.t0, start.q0, start.p0, args)
-        theta = bracketed_root(value, zero, at_zero, unit, value(unit), exists)
+        at_zero = event(g, start.t0, start.q0, start.p0, self.equations.args)
+        # The bracket has no derivative: that of a whole step would be compiled for nothing.
+        arrays, rest = eqx.partition((self, start), eqx.is_array)
+        at_unit = value(unit, *eqx.combine(lax.stop_gradient(arrays), rest))
+        theta = bracketed_root(value, zero, at_zero, unit, at_unit, exists)
         return self.point(start, theta)
 
 

@@ -12,13 +12,12 @@ from jaxtyping import Array
 import lanewise
 
 from ..base.types import Scalar
-from ..engine.bracket import divide
 
 _SERIES_UP_TO = 1.0
 """|β X²| up to which nine terms of the series are exact to round-off: 6 steps per revolution."""
 
 _TERMS = 9
-_C2, _C3 = ([1 / math.factorial(2 * k + n) for k in range(_TERMS)] for n in (2, 3))
+_C2, _C3, _C4, _C5 = ([1 / math.factorial(2 * k + n) for k in range(_TERMS)] for n in (2, 3, 4, 5))
 
 # The rounding of 1/6, 1/24 and 1/120 is the same in each step, and a drift of the energy of 3e-19
 # in each. It is added to the sums.
@@ -134,14 +133,43 @@ def from_pericentre(
 
 def _at(orbit: _Orbit, h: Scalar) -> tuple[_G, Array]:
     """The functions G_n at the X with t(X) = h, and whether all were found."""
+    # The search, with its branches and sums, has no derivative: that of `_on_time` is written out.
+    held, t = lax.stop_gradient((orbit, h))
+    X, is_root = _solve(held, t)
+    g = held.on_time(t, X, _universal(X, held.beta))
+    _, *functions = _on_time(X, *g, *orbit, h)
+    return _G(*functions), is_root
 
-    def equation(X):
-        return orbit.time(X, _universal(X, orbit.beta)) - h
 
-    # The equations of different orbits do not depend on one another: `divide` solves all of them.
-    zero = jnp.zeros_like(orbit.r0)
-    X, is_root = lanewise.implicit_root(equation, zero, lambda _, __: _solve(orbit, h), divide)
-    return orbit.on_time(h, X, _universal(X, orbit.beta)), is_root
+def _on_time(*operands: Array) -> list[Array]:
+    """X and the G_n of a solution of t(X) = h, as functions of the orbit and of h, to any order.
+
+    The operands are X, G₀ to G₃, r₀, η, β, ζ and h.
+    """
+    return lanewise.with_derivative(lambda *operands: list(operands[:5]), _slope, operands)
+
+
+def _slope(operands: list[Array], changes: dict[int, Array]) -> list[Array]:
+    """∂G_n/∂X = G_{n−1} with G₋₁ = −β G₁, ∂G_n/∂β = (n G_{n+2} − X G_{n+1})/2; dX by t(X) = h."""
+    X, *functions = _on_time(*operands)
+    g, orbit = _G(*functions), _Orbit(*operands[5:9])
+    beta, square = orbit.beta, X * X
+    z = beta * square
+    small = jnp.abs(z) <= _SERIES_UP_TO
+    small_z, far_beta = jnp.where(small, z, 0.0), jnp.where(small, 1.0, beta)
+    c4 = c5 = jnp.zeros_like(z)
+    for a, b in zip(_C4[::-1], _C5[::-1], strict=True):
+        c4, c5 = a - small_z * c4, b - small_z * c5
+    g4 = jnp.where(small, square * square * c4, (square / 2 - g.g2) / far_beta)
+    g5 = jnp.where(small, square * square * X * c5, (square * X / 6 - g.g3) / far_beta)
+    doubled = -X * g.g1, g.g3 - X * g.g2, 2 * g4 - X * g.g3, 3 * g5 - X * g4
+    by_beta = [x / 2 for x in doubled]
+    of_time = X, g.g2, orbit.eta * by_beta[2] + orbit.zeta * by_beta[3], g.g3, -1.0
+    defect = sum(x * changes[i] for i, x in enumerate(of_time, 5) if i in changes)
+    dX = -defect / orbit.radius(g)
+    dbeta = changes.get(7, 0.0)
+    by_X = -beta * g.g1, g.g0, g.g1, g.g2
+    return [dX, *(x * dX + y * dbeta for x, y in zip(by_X, by_beta, strict=True))]
 
 
 def _solve(orbit: _Orbit, h: Scalar) -> tuple[Array, Array]:

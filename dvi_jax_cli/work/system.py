@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from .._errors import (
     user_path,
 )
 from .expressions import parse_method
+from .forces import add_forces
 from .loader import Loader, in_one_line
 from .schema import COUNT, Integration, RunFile, SweepFile, SystemFile, Times
 from .table import NO_KEY
@@ -162,10 +163,21 @@ class Source:
 
 
 def find_source(file: SystemFile, folder: Path) -> Source:
-    """The system of a TOML file; files that it names are in `folder`.
+    """The system of a TOML file with its forces; files that it names are in `folder`.
 
     **Raises** `InputError`.
     """
+    source = _without_forces(file, folder)
+    if file.force is None:
+        return source
+    rule = "no forces for a dvi.System or a ring: they are added to a systems.Problem"
+    fits = source.problem is not None and file.ring is None
+    require(fits, "force", "it is given", rule)
+    problem = add_forces(source.problem, file.force, file.args or {}, source.loader)
+    return replace(source, problem=problem, system=problem.system)
+
+
+def _without_forces(file: SystemFile, folder: Path) -> Source:
     loader, name, date = Loader(folder), file.system, file.state.date
     rule = "q0 and p0; a date only with system = solar_system"
     require(date is None or name == "solar_system", "state.date", describe(date), rule)
