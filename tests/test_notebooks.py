@@ -21,7 +21,8 @@ for needed in ("jupytext", "nbclient", "nbformat", "ipykernel"):
 NAMES = [
     "alpha_particles", "breakdown_of_mu", "discovering_invariants", "events", "fitting",
     "general_relativity", "gpu", "how_long", "limits", "magnetic_moment", "planets",
-    "polar_motion", "quick_start", "storage_ring", "sweeps", "the_paper", "your_own_system",
+    "polar_motion", "quick_start", "radiating_ring", "storage_ring", "sweeps", "the_paper",
+    "your_own_system",
 ]  # fmt: skip
 FROM_THE_EPHEMERIS = {"general_relativity", "polar_motion"}
 

@@ -39,6 +39,30 @@ def test_optics_and_orbit_of_madx(madx):
     assert ring.get("p*", "x_max").tolist() == [0.03]
 
 
+def test_chromaticity_of_madx(madx):
+    """Of TWISS and PTC, whose dq1 and dq2 are derivatives by PT = βδ for a velocity βc. TWISS with
+    `chrom` takes differences with DELTAP, which are others for bends with inclined faces only."""
+    pt = {}
+    for face in (np.pi / 32, 0.0):
+        madx.input(
+            f"beam,particle=electron,energy=1; b: sbend,l=1.5,angle={np.pi / 16},e1={face},"
+            f"e2={face}; qf: quadrupole,l=0.4,k1=1.3; qd: quadrupole,l=0.4,k1=-1.3;"
+            "r: sequence,l=5.4; qf,at=0.2; b,at=1.55; qd,at=2.9; b,at=4.25; endsequence;"
+            "use,sequence=r;"
+        )
+        both = [madx.twiss(sequence="r", chrom=chrom).summary for chrom in (False, True)]
+        plain, differences = (np.array([s.dq1, s.dq2]) for s in both)
+        madx.input("ptc_create_universe; ptc_create_layout,model=2,method=6,nst=20,exact=true;")
+        madx.input("ptc_twiss,icase=5,no=2; ptc_end;")
+        ptc = madx.table.ptc_twiss.summary
+        np.testing.assert_allclose([ptc.dq1, ptc.dq2], plain, rtol=1e-7)
+        ours = rings.optics(rings.from_madx(madx.sequence.r)).chromaticity
+        np.testing.assert_allclose(ours, plain, rtol=5e-6)
+        pt[face] = np.abs(differences / plain - 1)
+    assert pt[0.0].max() < 5e-6
+    assert pt[np.pi / 32].min() > 0.05
+
+
 def test_a_cavity_of_madx(madx):
     madx.input(
         "beam,particle=electron,energy=1.0; rf: rfcavity,l=0.2,volt=1,freq=499.654,lag=0.55;"

@@ -36,8 +36,8 @@ SIZE = 240, 160
 NOTEBOOKS = {
     "quick_start": 1, "your_own_system": 0, "discovering_invariants": 0, "limits": 0,
     "how_long": 0, "magnetic_moment": 0, "breakdown_of_mu": 0, "sweeps": 0, "fitting": 0,
-    "alpha_particles": 0, "events": 0, "storage_ring": 2, "planets": 0, "general_relativity": 0,
-    "polar_motion": 0, "gpu": 0, "the_paper": 1,
+    "alpha_particles": 0, "events": 0, "storage_ring": 2, "radiating_ring": 1, "planets": 0,
+    "general_relativity": 0, "polar_motion": 0, "gpu": 0, "the_paper": 1,
 }  # fmt: skip
 """Notebook → which of its pictures."""
 

@@ -75,7 +75,7 @@ class Brownian(BrownianPath):
     def __check_init__(self):
         whole("substeps", self.substeps)
         if isinstance(self.key, str | float):  # other kinds may be axes, or traced
-            _words(self.key)
+            words_of(self.key)
 
     def check(self, num_steps):
         first = jnp.asarray(self.first_step)
@@ -88,7 +88,7 @@ class Brownian(BrownianPath):
 
     def increments(self, k, interval, parts, count):
         def term(i, number):
-            return _normal(self.key, number, count, interval.h.dtype)
+            return normals(self.key, number, count, interval.h.dtype)
 
         return self._sums(k, interval, jnp.zeros((parts, count), interval.h.dtype), term)
 
@@ -194,11 +194,11 @@ def as_path(path: Any) -> BrownianPath | None:
     # Here and not in `Brownian`: keys of JAX have a type that generated code does not take.
     path = path if isinstance(path, Brownian) else Brownian(path)
     # Of its own class, which may have other increments.
-    words, first_step = _words(path.key), jnp.asarray(path.first_step)
+    words, first_step = words_of(path.key), jnp.asarray(path.first_step)
     return dataclasses.replace(path, key=words, first_step=first_step)
 
 
-def _words(key: Any) -> Array:
+def words_of(key: Any) -> Array:
     try:
         words = jnp.asarray(key)
     except TypeError:
@@ -250,11 +250,11 @@ def _interior(key: Array, number: Array, x: Scalar, count: int, dtype: Any) -> t
 
 def _pair(key: Array, number: Array, count: int, dtype: Any, node: Any = 0) -> tuple[Array, Array]:
     """Increment and area over a unit time: normals with the variances 1 and 1/12."""
-    z, y = jnp.split(_normal(key, number, 2 * count, dtype, node), 2)
+    z, y = jnp.split(normals(key, number, 2 * count, dtype, node), 2)
     return z, y / math.sqrt(12)
 
 
-def _normal(key: Array, number: Array, count: int, dtype: Any, node: Any = 0) -> Array:
+def normals(key: Array, number: Array, count: int, dtype: Any, node: Any = 0) -> Array:
     """``jax.random.normal(jax.random.fold_in(key, number), (count,), dtype)`` to round-off; other
     numbers for each other `node`."""
     # What `fold_in` does: the words of the number, encrypted with the key, are a new key.

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from lanewise.jaxprs.jaxapi import is_traced
 
-from ...base.checks import electronvolts, in_range, instance, whole
+from ...base.checks import electronvolts, in_range, instance
 from ._maps import RingPart
 from ._optics import FRAMES, SLICED_PARTS, closed_orbit, one_turn, optics
 from ._radiation import ELECTRON, constants
@@ -97,44 +97,38 @@ def in_phase(ring: Ring, where: Where = "cavity") -> Ring:
     return ring.set(cavities, lag=angle / ring.get(cavities, "wave_number"))
 
 
-def tapered(ring: Ring, where: Where = "*", rounds: int = 2) -> Ring:
+def tapered(ring: Ring, where: Where = "*") -> Ring:
     """The ring whose magnets have fields in proportion to the local momentum 1 + δ of the closed
     orbit, so that the orbit is that of the ring without radiation, but for δ.
 
     All fields of a magnet and its loss of energy are scaled, by the mean of δ at its ends; the
-    change of δ within a magnet remains. `rounds`: how often the closed orbit is computed. pyAT's
-    `tapering` does the same, except for a factor (1 + δ)³ in the loss of energy in a magnet.
-    **Raises** as `optics`.
+    change of δ within a magnet remains. pyAT's `tapering` does the same, except for a factor
+    (1 + δ)³ in the loss of energy in a magnet. **Raises** as `optics`.
 
     A magnet has the new parameter `scale`.
     """
-    ends = RingPart("scaled_in"), RingPart("scaled_out")
-    for _ in range(whole("rounds", rounds)):
-        columns, program = dict(ring.columns), ring.program
-        magnets = np.intersect1d(ring.where(where), _elements(ring, MAGNETS))
-        delta = optics(ring, chromatic=False).orbit[:, 5]
-        scale = jnp.ones(len(ring)).at[magnets].set((1 + (delta[:-1] + delta[1:]) / 2)[magnets])
-        old = columns.get("scale", jnp.ones(len(ring)))
-        scale = jnp.where(np.isin(np.arange(len(ring)), magnets), scale, old)
-        columns["scale"] = scale
-        for name, power in (("loss", 3), ("excitation", 2.5)):
-            if name in columns:
-                columns[name] = columns[name] * (scale / old) ** power
-        new = [i for i in magnets if "scale" not in program.parameters[i]]
-        first, parts = len(program.parts), program.parts
-        if new and ends[0] in parts:
-            first = parts.index(ends[0])
-        elif new:
-            parts = *parts, *ends
-        rows = []
-        for i in range(len(ring)):
-            lines = [row for row in program.rows if row[1] == i]
-            rows += [(first, i), *lines, (first + 1, i)] if i in new else lines
-        parameters = tuple(
-            p | {"scale"} if i in new else p for i, p in enumerate(program.parameters)
-        )
-        ring = _variant(ring, columns, parts=parts, rows=tuple(rows), parameters=parameters)
-    return ring
+    columns, program = dict(ring.columns), ring.program
+    magnets = np.intersect1d(ring.where(where), _elements(ring, MAGNETS))
+    delta = optics(ring, chromatic=False).orbit[:, 5]
+    scale = jnp.ones(len(ring)).at[magnets].set((1 + (delta[:-1] + delta[1:]) / 2)[magnets])
+    old = columns.get("scale", jnp.ones(len(ring)))
+    scale = jnp.where(np.isin(np.arange(len(ring)), magnets), scale, old)
+    columns["scale"] = scale
+    for name, power in (("loss", 3), ("excitation", 2.5)):
+        if name in columns:
+            columns[name] = columns[name] * (scale / old) ** power
+    new = [i for i in magnets if "scale" not in program.parameters[i]]
+    first, parts, ends = len(program.parts), program.parts, ("scaled_in", "scaled_out")
+    if new and RingPart(ends[0]) in parts:
+        first = parts.index(RingPart(ends[0]))
+    elif new:
+        parts = *parts, *map(RingPart, ends)
+    rows = []
+    for i in range(len(ring)):
+        lines = [row for row in program.rows if row[1] == i]
+        rows += [(first, i), *lines, (first + 1, i)] if i in new else lines
+    parameters = tuple(p | {"scale"} if i in new else p for i, p in enumerate(program.parameters))
+    return _variant(ring, columns, parts=parts, rows=tuple(rows), parameters=parameters)
 
 
 def radiation_integrals(ring: Ring) -> Array:

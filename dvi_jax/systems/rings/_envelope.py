@@ -15,7 +15,7 @@ from ...base.checks import instance, require
 from ...base.inputs import real_numbers
 from ...base.printing import printable
 from ._maps import KICKS, Particle
-from ._optics import _modes as modes, closed_orbit, maps  # pyright: ignore[reportPrivateUsage]
+from ._optics import closed_orbit, maps, normal_modes
 from ._ring import Ring
 
 
@@ -85,11 +85,11 @@ def equilibrium(ring: Ring, guess: Array | None = None, epsilon: float = 0.0) ->
     """
     instance("ring", ring, Ring, "a rings.Ring")
     ring, values = ring.at(real_numbers("epsilon", epsilon)), {}
-    for name in ("loss", "voltage"):
+    for name, noun in (("loss", "magnets that radiate"), ("voltage", "a cavity with a voltage")):
         column = ring.columns.get(name)
         is_zero = not is_traced(column) and not np.any(np.asarray(0 if column is None else column))
-        values[name] = None if is_zero else column
-    hint = "Use rings.radiating(ring) of a ring with a cavity."
+        values[noun] = None if is_zero else column
+    hint = "Use rings.radiating(ring) of a ring with a rings.cavity whose voltage is not zero."
     require("rings.equilibrium(ring)", values, hint=hint)
     return _equilibrium(ring, closed_orbit(ring, guess=guess))
 
@@ -129,7 +129,7 @@ def _equilibrium(ring: Ring, orbit: Array) -> Equilibrium:
     zs, Ms, Bs, elements = _moments(ring, orbit)
     M = Ms[-1]
     start = jnp.linalg.solve(jnp.eye(36) - jnp.kron(M, M), Bs[-1].ravel()).reshape(6, 6)
-    v, _ = modes(M, jnp.zeros_like(M))
+    v, _ = normal_modes(M, jnp.zeros_like(M))
     eigenvalues = jnp.sum(jnp.conj(v) * (v @ M.T), 1) / jnp.sum(jnp.abs(v) ** 2, 1)
     rates = -jnp.log(jnp.abs(eigenvalues))
     start = jnp.where(jnp.all(rates > 0), (start + start.T) / 2, jnp.nan)

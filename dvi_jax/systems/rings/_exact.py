@@ -16,7 +16,7 @@ from ._maps import (
     near_identity,
     quarters,
 )
-from ._radiation import emit
+from ._radiation import emit, shaken
 
 
 def rotation(x: Any, y: Any, angle: Any) -> tuple[Any, Any]:
@@ -221,17 +221,26 @@ def second_order_bend(part: RingPart) -> list[Piece]:
     def one_slice(z, par, turn, sign):
         thickness = par["length"] / part.slices
 
-        def shine(z, i):
-            return emit(curved_kick, z, kicks[i] * thickness, par, part, sign, i, turn)
+        def kick(z, i, sign):
+            length = kicks[i] * thickness
+
+            def with_loss(z):
+                z = emit(curved_kick, z, length, par, part, 1)
+                return _second_order_kick(z, length, par, order)
+
+            if sign > 0:
+                return shaken(curved_kick, with_loss, z, length, par, part, i, turn)
+            z = _second_order_kick(z, -length, par, order)
+            return emit(curved_kick, z, length, par, part, -1)
 
         # Not a flow: two of these drifts are not one, and the inverse is solved for.
         for i in range(len(coasts))[::sign]:
             if sign < 0 and i < len(kicks):
-                z = shine(_second_order_kick(z, -kicks[i] * thickness, par, order), i)
+                z = kick(z, i, -1)
             coast = near_identity(lambda z, par, c=coasts[i]: _curved_drift(z, c * thickness, par))
             z = coast.apply(z, par, turn, sign)
             if sign > 0 and i < len(kicks):
-                z = _second_order_kick(shine(z, i), kicks[i] * thickness, par, order)
+                z = kick(z, i, 1)
         return z
 
     return [Piece(one_slice, part.slices)]

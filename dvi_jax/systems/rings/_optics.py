@@ -303,7 +303,7 @@ def _analysis(xp: Any, ring: Ring, z: Any, six: bool, chromatic: bool, by_part: 
         )
     *_, (zs, Ms, dM, D, slip, size), _ = state
     zs, Ms, slip = (xp.where(size < _SMALL, x, np.nan) for x in (zs, Ms, slip))
-    v, chromaticity = _modes(Ms[-1, :n, :n], dM[:n, :n], xp)
+    v, chromaticity = normal_modes(Ms[-1, :n, :n], dM[:n, :n], xp)
     vs = xp.einsum("rij,kj->rki", Ms[:, :n, :n], v)
     upright = _upright(xp, ring, pieces, vs)
     x, px = (xp.diagonal(upright[:, :, i::2], axis1=1, axis2=2) for i in (0, 1))
@@ -369,7 +369,7 @@ def _upright(xp: Any, ring: Ring, pieces: np.ndarray, v: Any) -> Any:
     return xp.concatenate([cos * x - sin * y, cos * y + sin * x, v[..., 4:]], -1)
 
 
-def _modes(M: Any, dM: Any, xp: Any = jnp) -> tuple[Any, Any]:
+def normal_modes(M: Any, dM: Any, xp: Any = jnp) -> tuple[Any, Any]:
     """Vectors v_k of the normal modes of M, v_k† S v_k = 2i, in the order of the planes, with a
     real component in their own plane, and the derivative of their tunes by δ; NaN if unstable."""
     n = len(M)

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ...problem.paths import _normal as normal  # pyright: ignore[reportPrivateUsage]
+from ...problem.paths import normals
 from ._maps import KICKS, Parameters, Particle, Piece, RingPart, near_identity
 
 ELECTRON = 510998.95069
@@ -32,32 +32,52 @@ def radiant(kick: Kick) -> Callable[..., Particle]:
 
     A photon leaves along the velocity: p → p − K p² for p = 1 + δ, and px/p, py/p do not change.
     K is the `loss` times \|e × B\|² ds, B the field over Bρ and e the direction of the velocity.
-    The kick is that of the particle before its loss, as in pyAT's pass methods with radiation.
+    The kick is that of the particle before its loss, as in pyAT's pass methods with radiation. The
+    noise of the loss is in the middle of the kick, see `shaken`.
     """
 
     def move(z, length, par, part, sign, number, turn):
         if "loss" not in par:
             return kick(z, sign * length, par, part.order)
-        noise = _noise(par, part, number, turn)
-        if sign > 0:
-            change = _lose(z, _rate(kick, z, length, par, part, noise), 1)
+
+        def with_loss(z):
+            change = _lose(z, _rate(kick, z, length, par, part), 1)
             return kick(z, length, par, part.order).plus(**change)
+
+        if sign > 0:
+            return shaken(kick, with_loss, z, length, par, part, number, turn)
         origin, change = z, {"delta": 0.0}
         for _ in range(_ITERATIONS):
             start = z.plus(delta=change["delta"])
             origin = kick(start, -length, par, part.order)._replace(delta=z.delta)
-            change = _lose(origin, _rate(kick, origin, length, par, part, noise), -1)
+            change = _lose(origin, _rate(kick, origin, length, par, part), -1)
         return origin.plus(**change)
 
     return move
 
 
-def emit(kick: Kick, z, length, par, part, sign, number, turn) -> Particle:
+def emit(kick: Kick, z, length, par, part, sign) -> Particle:
     """The particle after the loss of a kick over a length [m], or before it for sign −1."""
-    if "loss" not in par:
-        return z
+    return z.plus(**_lose(z, _rate(kick, z, length, par, part), sign)) if "loss" in par else z
+
+
+def shaken(kick: Kick, move, z, length, par, part, number, turn) -> Particle:
+    """``move(z)`` of a kick, with half of the noise of its photons before and half after it.
+
+    All of it at one end would be an error of order 1 in the length of a kick, whose coefficients
+    add up to the sum of the squares of the kicks of a slice: a negative diffusion.
+    """
     noise = _noise(par, part, number, turn)
-    return z.plus(**_lose(z, _rate(kick, z, length, par, part, noise), sign))
+    if noise is None:
+        return move(z)
+    squares, path = _brightness(kick, z, par, part)
+    # Its square is the diffusion; without a derivative where there is no field.
+    diffusion = squares**1.5 * path * jnp.abs(length)
+    shines = diffusion > 0
+    root = jnp.where(shines, jnp.sqrt(jnp.where(shines, diffusion, 1.0)), 0.0)
+    half = -noise / 2 * par["excitation"] * root
+    z = move(z.plus(**_lose(z, half, 1)))
+    return z.plus(**_lose(z, half, 1))
 
 
 def wedge(side: str) -> Piece:
@@ -79,8 +99,14 @@ def _lose(z: Particle, rate: Any, sign: int) -> dict[str, Any]:
     return {"px": share * z.px, "py": share * z.py, "delta": share * p}
 
 
-def _rate(kick: Kick, z: Particle, length: Any, par: Parameters, part: RingPart, noise: Any) -> Any:
-    """K of a kick over a length [m], without and with noise."""
+def _rate(kick: Kick, z: Particle, length: Any, par: Parameters, part: RingPart) -> Any:
+    """K of a kick over a length [m]."""
+    squares, path = _brightness(kick, z, par, part)
+    return par["loss"] * squares * path * length
+
+
+def _brightness(kick: Kick, z: Particle, par: Parameters, part: RingPart) -> tuple[Any, Any]:
+    """The square of e × B, and the length of the path over that of the reference orbit."""
     h = par["h"] if "bend" in part.name else 0.0
     p, wide = 1 + z.delta, 1 + h * z.x
     u, v = z.px / p, z.py / p
@@ -95,14 +121,7 @@ def _rate(kick: Kick, z: Particle, length: Any, par: Parameters, part: RingPart,
         slopes = u * u + v * v
         squares = (radial**2 + vertical**2) * wide**2 + (radial * v - vertical * u) ** 2
         squares, path = squares / (wide * wide + slopes), wide + slopes / 2
-    rate = par["loss"] * squares * path * length
-    if noise is None:
-        return rate
-    # Its square is the diffusion; without a derivative where there is no field.
-    diffusion = squares**1.5 * path * jnp.abs(length)
-    shines = diffusion > 0
-    root = jnp.where(shines, jnp.sqrt(jnp.where(shines, diffusion, 1.0)), 0.0)
-    return rate - noise * par["excitation"] * root
+    return squares, path
 
 
 def _noise(par: Parameters, part: RingPart, number: int, turn: Any) -> Any:
@@ -114,5 +133,5 @@ def _noise(par: Parameters, part: RingPart, number: int, turn: Any) -> Any:
         return None
     node = par["counter"].astype(jnp.uint32) + jnp.asarray(par["slice"], jnp.uint32)
     words = jnp.asarray(turn, jnp.uint32)
-    draw = normal(par["key"], words, 1, jnp.dtype(float), node)[0]
+    draw = normals(par["key"], words, 1, jnp.dtype(float), node)[0]
     return draw / math.sqrt(abs(kicks[number]))

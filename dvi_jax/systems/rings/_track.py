@@ -12,16 +12,17 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 import lanewise
-from lanewise.jaxprs.jaxapi import linear_map
+from lanewise.jaxprs.jaxapi import linear_map, threefry2x32
 from lanewise.linear_map import with_change
 
-from ...base.checks import instance, whole
+from ...base.checks import instance, require, whole
 from ...base.machine import results_memory
 from ...base.printing import printable
 from ...integration.reconstruction import fold_blocks
+from ...problem.paths import words_of
+from ._damping import MAGNETS
 from ._losses import loss_places
 from ._maps import Particle
-from ._quantum import fly_with_noise
 from ._ring import Ring
 from ._turn import Passage, coordinates, start
 
@@ -130,8 +131,11 @@ def track(
     shape = z.shape[:-1]
     epsilon = jnp.broadcast_to(jnp.asarray(epsilon, float), shape).reshape(-1)
     counts = turns // every, every, first_turn
-    fly = _track if key is None else functools.partial(fly_with_noise, key=key)
-    states, turn, row, last = fly(ring, z.reshape(-1, 6), epsilon, counts)
+    if key is not None:
+        hint = "The noise is that of a ring that radiates: use rings.radiating(ring)."
+        require("rings.track(key=...)", {"loss": ring.columns.get("loss")}, hint=hint)
+    words = None if key is None else words_of(key)
+    states, turn, row, last = _track(ring, z.reshape(-1, 6), epsilon, counts, words)
     states = states[:, -1] if turns == every else states
     owner = np.asarray(ring.program.rows, np.int32)[:, 1]
     element = jnp.where(row < 0, -1, jnp.asarray(owner)[row])
@@ -146,13 +150,14 @@ def _batched(function, *flags):
 
 
 @eqx.filter_jit
-def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
+def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int], words: Any):
+    """`words`: of the key of the noise, or None; particle i has the key ``fold_in(key, i)``."""
     blocks, every, first = counts
     passage = Passage.from_ring(ring)
 
-    def forward(numbers, tables, z, epsilon):
+    def forward(numbers, tables, z, epsilon, key=None):
         rows, slopes = tables
-        line = Passage(rows, slopes, numbers, passage.parts)
+        line = Passage(rows, slopes, numbers, passage.parts, key)
 
         def one_turn(state, _):
             k, flight = state
@@ -165,6 +170,17 @@ def _track(ring: Ring, z: Array, epsilon: Array, counts: tuple[int, int, int]):
         state = jnp.asarray(first, jnp.int32), start(Particle(*z))
         (_, flight), states = lax.scan(block, state, None, blocks)
         return states, (flight.turn, flight.row, jnp.stack(flight.last))
+
+    if words is not None:
+        slices = [p.slices if p.name in MAGNETS else 0 for p in passage.parts]
+        slices = np.asarray(slices)[passage.numbers["part"]]
+        # Each slice of each magnet has a number of its own.
+        rows = {**passage.rows, "counter": jnp.asarray(np.cumsum(slices) - slices, float)}
+        index = jnp.arange(len(z), dtype=jnp.uint32)
+        keys = jnp.stack(threefry2x32(words, jnp.zeros_like(index), index), 1)
+        batch = _batched(forward, False, False, True, True, True)
+        states, losses = batch(passage.numbers, (rows, passage.slopes), z, epsilon, keys)
+        return states, *losses
 
     @jax.custom_jvp
     def states_and_losses(tables, z, epsilon):
