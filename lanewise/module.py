@@ -1,6 +1,7 @@
 """An LLVM module while it is written: its parameters, constants, scratch memory and functions."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +26,21 @@ class Module:
         self.values: list[int] = []
         self.globals: list[str] = []
         self.functions: dict[tuple[str, int], str] = {}
+        self.repeated_functions: frozenset[Any] = frozenset()  # the jaxprs of which one is written
+        self.written_functions: dict[Any, Any] = {}
         self.declarations: set[str] = set()
         self.scratch_bytes = 0
         self._constants: dict[bytes, str] = {}
+
+    def of_function(self) -> "Module":
+        """The module of a function that is called: its memory and inputs are its own."""
+        inner = type(self)(self.b.W, 1)
+        inner.globals, inner.functions = self.globals, self.functions
+        inner.declarations, inner._constants = self.declarations, self._constants
+        inner.repeated_functions = self.repeated_functions
+        inner.written_functions = self.written_functions
+        inner.b.limit = self.b.limit
+        return inner
 
     def parameter(self, value: int) -> Num:
         """A whole number that is an input of the machine code: another one needs no new code."""

@@ -72,6 +72,21 @@ def operation_count(jaxpr: Any) -> int:
     return sum(_operations(eqn) for eqn in _innermost(jaxpr))
 
 
+def repeated_functions(jaxpr: Any, size: int) -> frozenset[Any]:
+    """The jaxprs of at least so many operations that a function calls in more than one place."""
+    places: dict[Any, int] = {}
+
+    def count(jaxpr: Any) -> None:
+        for function in (f.jaxpr for eqn in jaxpr.eqns for f in _evaluated(eqn)):
+            places[function] = places.get(function, 0) + 1
+            if places[function] == 1:
+                count(function)
+
+    count(jaxpr)
+    repeated = (function for function, number in places.items() if number > 1)
+    return frozenset(function for function in repeated if operation_count(function) >= size)
+
+
 def largest_bytes(jaxpr: Any) -> int:
     """Bytes of the largest operands and results of an operation, with all arrays of one."""
     equations = ((*eqn.invars, *eqn.outvars) for eqn in _innermost(jaxpr))

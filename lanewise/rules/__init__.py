@@ -1,6 +1,7 @@
 """How the primitives of JAX are written in LLVM IR: each file registers its rules in `RULES`."""
 
 from . import (
+    calls as calls,
     elementary as elementary,
     elementwise as elementwise,
     elimination as elimination,

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ..evaluator import RULES, Evaluator, check_types, parts_along
-from ..jaxprs.jaxapi import bodies
 from ..llvm.ir import NotCompilable, check_size
 from ..llvm.memory import Buffer
 from ..llvm.values import SMALL, Value
@@ -166,15 +165,9 @@ def _move(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> 
     ]
 
 
-def _call(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
-    (body,) = bodies(eqn)
-    return evaluator.evaluate(body, values, places)
-
-
 def _identity(evaluator: Evaluator, eqn: Any, values: list[Value], places: list) -> list[Value]:
     return values
 
 
 RULES |= dict.fromkeys(MOVES, check_types(_move))
-RULES |= dict.fromkeys(CALLS, _call)
 RULES |= dict.fromkeys(["reshard", "sharding_constraint", "mesh_cast"], _identity)

@@ -9,7 +9,13 @@ from typing import Any
 from .. import rules as rules  # each file registers its rules with the evaluator
 from ..evaluator import RULES, Evaluator
 from ..frame import kernel_text, pointers
-from ..jaxprs.extent import carry_size, most_operations, operation_count, primitives_in
+from ..jaxprs.extent import (
+    carry_size,
+    most_operations,
+    operation_count,
+    primitives_in,
+    repeated_functions,
+)
 from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import check_size, check_that, check_type
 from ..llvm.memory import Buffer, contiguous, load_row, stored_type
@@ -93,6 +99,10 @@ def operand_value(evaluator: Evaluator, buffer: Buffer) -> Value:
 
 _LONG_PROGRAM = 10_000  # operations
 
+LARGE = 600
+"""Operations of a function from which it is written once for all its calls. A round on assumptions
+is shorter: it has no such call."""
+
 
 class Numbers:
     """Number by number, in vectors of trajectories; it is tried for every program."""
@@ -123,6 +133,7 @@ class Numbers:
             vectors = vectors_for(state, count) if state or size <= 24 else 1
         module = Module(*variant(lanes, vectors))
         module.b.limit = limit
+        module.repeated_functions = repeated_functions(function.jaxpr, LARGE)
         text = kernel_of(module, function, lane_flags)
         b, values, scratch = module.b, tuple(module.values), module.scratch_bytes
         return Code(text, b.W * b.U, values, (), b.operations, scratch, b.W, b.U)
