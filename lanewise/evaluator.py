@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .assumed import Assumptions
-from .jaxprs.jaxapi import ClosedJaxpr, Jaxpr, Literal
+from .jaxprs.jaxapi import ClosedJaxpr, Jaxpr, Literal, variables
 from .llvm.ir import NotCompilable, Num, check_size, check_type
 from .llvm.memory import Buffer, load, load_row, store, store_row
 from .llvm.values import MOST_ENTRIES, SMALL, Entries, Value, Values, objects
@@ -62,8 +62,9 @@ class Evaluator:
 
         # One call gives the sine and the cosine of a number, and costs little more than one of
         # them.
-        sines_and_cosines = _sines_and_cosines(jaxpr)
-        for eqn in jaxpr.eqns:
+        equations = _needed(jaxpr)
+        sines_and_cosines = _sines_and_cosines(equations)
+        for eqn in equations:
             inputs = [read(v) for v in eqn.invars]
             if id(eqn) in sines_and_cosines:
                 (environment[eqn.outvars[0]],) = RULES[SINE_AND_COSINE](self, eqn, inputs, [None])
@@ -239,11 +240,21 @@ def _places(jaxpr: Jaxpr, destinations: Sequence[Buffer | None]) -> dict[Any, Bu
     return places
 
 
-def _sines_and_cosines(jaxpr: Jaxpr) -> set[int]:
+def _needed(jaxpr: Jaxpr) -> list[Any]:
+    """The equations from which the outputs follow. A gradient contains those of its value too."""
+    needed, equations = set(variables(jaxpr.outvars)), []
+    for eqn in reversed(jaxpr.eqns):
+        if eqn.effects or not needed.isdisjoint(eqn.outvars):
+            needed.update(variables(eqn.invars))
+            equations.append(eqn)
+    return equations[::-1]
+
+
+def _sines_and_cosines(equations: Sequence[Any]) -> set[int]:
     """The equations that are the sine or the cosine of a variable of which both are taken."""
     calls = [
         (eqn.primitive.name, eqn.invars[0], id(eqn))
-        for eqn in jaxpr.eqns
+        for eqn in equations
         if eqn.primitive.name in ("sin", "cos") and not isinstance(eqn.invars[0], Literal)
     ]
     sines, cosines = ({x for name, x, _ in calls if name == f} for f in ("sin", "cos"))

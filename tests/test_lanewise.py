@@ -29,7 +29,7 @@ from lanewise.jaxprs import extent
 from lanewise.jaxprs.traced import Trace
 from lanewise.llvm.ir import NotCompilable
 from lanewise.native import cache, machine, switches
-from lanewise.rules import moves
+from lanewise.rules import moves, rounds
 from lanewise.targets import TARGETS, Code
 from lanewise.targets.target import compiled_by
 
@@ -285,6 +285,49 @@ def test_rounds_without_rare_branches(left):
     np.testing.assert_array_equal(found[0][2], expected[2])
     assert_close(found[0], expected, 1e-11)
     assert not left
+
+
+def exchanging(x, length=20):
+    """A loop with branches: the functions of one number are needed a round later, of another one;
+    of q, in the middle of a long sum, in a branch only and in an inner loop."""
+
+    def step(carry, _):
+        q, p = carry
+        force = sum([jnp.sin(q) / jnp.sqrt(1 + q * q)] + [p / (k + 1.5) for k in range(length)])
+        inner = lax.fori_loop(0, 3, lambda _, y: 0.5 * y + jnp.cos(q), p)
+        p = p - 0.1 * lax.cond(lanewise.on_any(q > 0.5, rare=False), lambda: force, lambda: q)
+        new = lax.cond(p > 0, lambda: jnp.cos(p) + inner, lambda: 0.5 * q)
+        return (p, new + jnp.sin(new) + 1 / jnp.sqrt(1 + p * p)), new
+
+    return lax.scan(step, (x, 0.3 * x), None, length=30)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        functools.partial(looping, rare=False),
+        exchanging,
+        pytest.param(functools.partial(exchanging, length=1200), marks=pytest.mark.slow),
+    ],
+)
+def test_numbers_that_are_carried_to_the_next_round(monkeypatch, function):
+    """The same bits as where each round computes them."""
+    x = np.linspace(-2.0, 2.0, 37)
+    carried = jax.tree.leaves(jax.jit(lanewise.batched(function))(x))
+    ir = lanewise.explain(function, 1.0).parts[0].ir
+    monkeypatch.setattr(rounds, "carried_over", lambda *_: [])
+    jax.clear_caches()
+    assert_same(jax.tree.leaves(jax.jit(lanewise.batched(function))(x)), carried)
+    assert lanewise.explain(function, 1.0).parts[0].ir != ir
+
+
+def test_an_equation_without_a_use_takes_no_code():
+    """The derivative of a cosine is computed with the cosine itself, which needs no code."""
+    code = lanewise.explain(jax.jit(jax.grad(lambda x: jnp.cos(x) ** 2)), 1.0).parts[0].ir
+    assert "@sincos" in code  # both are needed
+    code = lanewise.explain(jax.jit(jax.grad(jnp.cos)), 1.0).parts[0].ir
+    assert "@sin_" in code
+    assert "cos" not in code
 
 
 TABLE = np.sin(np.arange(300.0))

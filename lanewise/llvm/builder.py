@@ -42,8 +42,8 @@ class Builder(Operations):
     ) -> list[Num]:
         """The carry once ``test(carry, i)``, the name of an i1, is false; `i` counts if `count`.
 
-        `carried_over(carry before a round, carry after it)` finds pairs (x, y) where y is what x
-        will be in the next round; x is then not computed but carried.
+        `carried_over(carry before a round, carry after it, numbers of the round)` finds pairs
+        (x, y) where y is what x will be in the next round; x is then not computed but carried.
         """
         start = [self.refs(number, wide) for number, wide in zip(carry, vec, strict=True)]
         # The preheader is the end of the block from which the loop is entered.
@@ -70,7 +70,7 @@ class Builder(Operations):
         assert all(wide or not a.vec for a, wide in zip(next_carry, vec, strict=True))
         next_names = [self.refs(a, wide) for a, wide in zip(next_carry, vec, strict=True)]
         next_counter = self.new(f"add nuw nsw i64 {counter}, 1") if count else ""
-        self.scopes.pop()
+        scope = self.scopes.pop()
         self.loops -= 1
         left_from = self.block
         self.emit(f"br label %{head}")
@@ -92,7 +92,8 @@ class Builder(Operations):
                 phi.serial: self.number(old, phi.dtype, wide)
                 for phi, old, wide in zip(phis, start, vec, strict=True)
             }
-            pairs = carried_over(phis, next_carry)
+            numbers = [x for x in scope.values() if isinstance(x, Num)]
+            pairs = carried_over(phis, next_carry, numbers)
             with self.writing(preheader):
                 firsts = [self.refs(self.recompute(x, entering), True) for x, _ in pairs]
             for (x, y), olds in zip(pairs, firsts, strict=True):
@@ -121,19 +122,19 @@ class Builder(Operations):
 
     def recompute(self, x: Num, substitutes: dict[int, Num]) -> Num:
         """The number x with other numbers in place of some that it is made of."""
-        if x.value is not None or (not x.op and x.serial not in substitutes):
-            return x
-        number = substitutes.get(x.serial)
-        if number is None:
-            args = [self.recompute(a, substitutes) for a in x.args]
+        first = next(iter(substitutes))  # numbers before it do not depend on any of them
+        open_, needed = [x], dict[int, Num]()
+        while open_:
+            y = open_.pop()
+            if y.serial > first and not (y.serial in substitutes or y.serial in needed):
+                needed[y.serial] = y
+                open_ += y.args
+        for serial, y in sorted(needed.items()):  # operands first
+            args = [substitutes.get(a.serial, a) for a in y.args]
             # A closed-off number is a name for another one and has no instruction of its own.
-            if x.op == "same":
-                number = args[0]
-            else:
-                assert x.write is not None
-                number = self.op(x.op, args, x.dtype, x.write)
-            substitutes[x.serial] = number
-        return number
+            assert y.write is not None or y.op == "same"
+            substitutes[serial] = self.op(y.op, args, y.dtype, y.write) if y.write else args[0]
+        return substitutes.get(x.serial, x)
 
     def branch(
         self,

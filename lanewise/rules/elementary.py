@@ -30,23 +30,21 @@ def elementary(evaluator: Evaluator, name: str, args: Sequence[Num]) -> Num:
     )
 
 
-def sincos(evaluator: Evaluator, x: Num) -> tuple[Num, Num]:
+def sincos(evaluator: Evaluator, x: Num) -> tuple[Num, ...]:
     """sin x and cos x in one call."""
     b = evaluator.b
     if x.value is not None:
         return elementary(evaluator, "sin", [x]), elementary(evaluator, "cos", [x])
 
-    def make() -> tuple[Num, ...]:
-        function, kind = _function(evaluator.module, "sincos", 1, x.vec), b.type("float64", x.vec)
-        pair = f"{{{kind}, {kind}}}"
-        calls = [b.new(f"call {pair} {function}({kind} {name})") for name in x.names]
-        b.operations += 2
-        return tuple(
-            b.number([b.new(f"extractvalue {pair} {y}, {i}") for y in calls], "float64", x.vec)
-            for i in range(2)
-        )
+    function, kind = _function(evaluator.module, "sincos", 1, x.vec), b.type("float64", x.vec)
+    pair = f"{{{kind}, {kind}}}"
 
-    return b.find_or_make(("sincos", x.serial), make)
+    def write(i: int, _: str, name: str) -> str:
+        call = f"call {pair} {function}({kind} {name})"
+        return f"extractvalue {pair} {b.find_or_make(call, lambda: b.new(call))}, {i}"
+
+    parts = (functools.partial(write, i) for i in range(2))
+    return tuple(b.op(f"call sincos {i}", (x,), "float64", w) for i, w in enumerate(parts))
 
 
 def _function(module: Module, name: str, count: int, vec: bool) -> str:

@@ -1,10 +1,10 @@
 """Numbers at the end of a round that the next round computes again at its beginning.
 
 A step ends with the energy, of the new state; the next one begins with the force, of the same
-state, and both need 1/r. A loop of rounds without branches carries such a number over instead.
+state, and both need 1/r. A loop carries such a number over instead.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from ..llvm.ir import Num
@@ -13,17 +13,22 @@ from ..llvm.ir import Num
 _COSTLY = frozenset(["sqrt", "div"])
 
 _MOST_PAIRS = 8  # numbers that are carried over
+_MOST_NUMBERS = 2000  # of a round: the search in a longer one takes more time than it saves
 
 
-def carried_over(state_before: Sequence[Num], state_after: Sequence[Num]) -> list[tuple[Num, Num]]:
-    """Pairs (x, y): x follows from the state before a round as y does from the state after it, so
-    that y is the next round's x."""
+def carried_over(
+    state_before: Sequence[Num], state_after: Sequence[Num], numbers: Iterable[Num]
+) -> list[tuple[Num, Num]]:
+    """Pairs (x, y) of numbers of a round: x follows from the state before it as y does from the
+    state after it, so that y is the next round's x."""
     place = {x.serial: i for i, x in enumerate(state_before)}
-    new_place = {x.serial: i for i, x in enumerate(state_after) if x.value is None and x.op}
+    new_place = {x.serial: i for i, x in enumerate(state_after) if x.value is None}
     names: dict[Any, int] = {}
     # The same names for both, so that equal forms have equal keys.
     first, second = _Forms(place, min(place), names), _Forms(new_place, min(place), names)
-    numbers = _all_of(state_after)
+    numbers = _all_of([*state_after, *numbers])
+    if len(numbers) > _MOST_NUMBERS:
+        return []
     for x in sorted(numbers, key=lambda x: x.serial):  # operands first, so that no call is deep
         first.key(x)
         second.key(x)

@@ -106,7 +106,8 @@ class Rounds:
         def body(k: Num, *old: Num) -> list[Num]:
             return [b.add(k, b.const(1, "int64")), *self.round_of(old, k, start)]
 
-        return b.loop_below(stop, [start, *numbers], [False, *self.vec], body)[1:]
+        carry, vec = [start, *numbers], [False, *self.vec]
+        return b.loop_below(stop, carry, vec, body, carried_over=carried_over)[1:]
 
     def _portions(
         self, state: Sequence[Num], vec: list[bool], size: Num, portion: Callable[..., list[Num]]

@@ -169,6 +169,6 @@ def vectors_for(state: int, operations: int) -> int:
         return max(1, min(8, 32 // max(state, 1)))
     if operations < 800 and state <= 12:
         return 4
-    if operations < 1500:
+    if operations < 2000:
         return 3 if state <= 12 else 2
     return 2 if operations < 4000 and state <= 12 else 1
