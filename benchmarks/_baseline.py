@@ -46,17 +46,19 @@ class Run(NamedTuple):
 class Baseline:
     """baseline.c as a shared library, built in a folder that is removed with the object.
 
+    `source` may be another file that contains it.
+
     **Raises** `NoCompilerError` if neither $CC nor gcc, cc, clang on the PATH compiles it.
     """
 
-    def __init__(self):
+    def __init__(self, source: Path = SOURCE):
         self._folder = tempfile.TemporaryDirectory(prefix="dvi_jax_baseline_")
         target = Path(self._folder.name) / "baseline.so"
-        self.command = compile_source(SOURCE, target)
-        self._library = ctypes.CDLL(str(target))
-        self.width = int(self._library.vector_width())
-        self.has_libmvec = bool(self._library.has_libmvec())
-        self._block = int(self._library.block())
+        self.command = compile_source(source, target)
+        self.library = ctypes.CDLL(str(target))
+        self.width = int(self.library.vector_width())
+        self.has_libmvec = bool(self.library.has_libmvec())
+        self._block = int(self.library.block())
 
     def __str__(self) -> str:
         sines = "libmvec" if self.has_libmvec else "libm, lane by lane"
@@ -174,7 +176,7 @@ class Baseline:
             key: None if shape is None else _empty(shape)
             for key, shape in shapes(n, padded).items()
         }
-        function = getattr(self._library, f"{name}_one" if one else name)
+        function = getattr(self.library, f"{name}_one" if one else name)
         function.restype = None
         given = [_whole(padded), *numbers, *map(_address, start)]
         addresses = [_address(x) for x in outputs.values()]
