@@ -23,9 +23,10 @@ def add_forces(
 
     def value_of(key: str, value: Any) -> Any:
         if isinstance(value, dict):  # of harmonics: "2" is a degree, "2,1" a degree and an order
-            return {_numbers(f"{key}.{k}", k): value_of(f"{key}.{k}", v) for k, v in value.items()}
+            parts = {f"{key}.{index}": index for index in value}
+            return {_numbers(at, index): value_of(at, value[index]) for at, index in parts.items()}
         if isinstance(value, list):
-            return tuple(value_of(key, v) for v in value)
+            return tuple(value_of(key, part) for part in value)
         if not isinstance(value, str):
             return value
         if ".py:" in value:
@@ -37,14 +38,15 @@ def add_forces(
         return lambda args: args[name]
 
     terms = []
-    for i, table in enumerate(tables):
-        key, name = f"force[{i}]", table.get("name", "")
+    for number, table in enumerate(tables):
+        key, name = f"force[{number}]", table.get("name", "")
         defect = NO_KEY if "name" not in table else ""
         require_name(f"{key}.name", name, CLASSES, defect=defect)
         names = inspect.signature(CLASSES[name]).parameters
-        for k in table.keys() - {"name"}:
-            require_name(f"{key}.{k}", k, names, defect=f"{name} has no such parameter")
-        options = {k: value_of(f"{key}.{k}", v) for k, v in table.items() if k != "name"}
+        values = {option: value for option, value in table.items() if option != "name"}
+        for option in values:
+            require_name(f"{key}.{option}", option, names, defect=f"{name} has no such parameter")
+        options = {option: value_of(f"{key}.{option}", values[option]) for option in values}
         with as_input_error(key, f"parameters of {name}: {one_of(names)}"):
             terms.append(CLASSES[name](**options))
     with as_input_error("force", "a system whose args are a table"):

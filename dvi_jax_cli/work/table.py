@@ -183,6 +183,16 @@ NonEmpty = Annotated[list[V], Field(min_length=1)]
 Two = Annotated[list[V], Field(min_length=2, max_length=2)]
 
 Rows = TypeAliasType("Rows", union(number=Number, array=NonEmpty["Rows"]))
+ForceValue = TypeAliasType(
+    "ForceValue",
+    union(
+        boolean=bool,
+        number=Scalar,
+        array=NonEmpty["ForceValue"],
+        text=Text,
+        table=dict[str, "ForceValue"],
+    ),
+)
 if TYPE_CHECKING:
     Array = np.ndarray
 else:
