@@ -51,6 +51,36 @@ def test_the_pericentre_of_mercury_over_ten_thousand_orbits():
     assert abs(4 * errors[1] - errors[0]) / 3 < 3e-9
 
 
+def test_the_potential_with_the_precession_of_mercury():
+    """The advance in each revolution is that of a central force, and 43 arcseconds a century."""
+    a, e, turns = 0.38709893, 0.20563069, 10
+    period, p = 2 * np.pi * np.sqrt(a**3 / SUN), a * (1 - e * e)
+    start = a * (1 - e), np.sqrt(SUN * (1 + e) / (a * (1 - e)))
+    turning = dvi.Section(lambda q, p: q @ p, max_crossings=turns)  # pericentres
+    system = dvi.System(kepler, force=forces.PrecessionPotential(lambda args: args["c"]))
+    run = {
+        "h": period / 200,
+        "num_steps": 200 * turns + 20,
+        "method": dvi.KahanLi(8),
+        "epsilon": 1.0,
+    }
+
+    @jax.vmap
+    def angle(c):
+        args, q0, p0 = {"mu": SUN, "c": c}, [start[0], 0.0], [0.0, start[1]]
+        sol = dvi.integrate(
+            system, q0, p0, args=args, observe=turning, save=dvi.Save(final=True), **run
+        )
+        q = sol.observed.qs[-1]
+        return jnp.arctan2(q[1], q[0])
+
+    light = LIGHT * np.array([1.0, 1e-2])  # the second: in which the second order is seen
+    exact = 2 * np.pi * ((1 - 6 * SUN / (light**2 * p)) ** -0.5 - 1)
+    np.testing.assert_allclose(angle(jnp.asarray(light)), turns * exact, rtol=0, atol=1e-11)
+    assert abs(exact[1] / (6 * np.pi * SUN / (light[1] ** 2 * p)) - 1) > 1e-3
+    assert np.degrees(exact[0]) * 3600 * 36525 / period == pytest.approx(42.98, abs=0.005)
+
+
 def disturbing(degree, a, e, inc):
     """−J_n times the mean of the potential over M and the node, for J_n = 1: Kaula 1966, (3.71)."""
     u = 2 * np.pi * np.arange(64) / 64

@@ -26,5 +26,6 @@ from ._gravity import (
 from ._relativity import (
     LenseThirring as LenseThirring,
     PostNewtonian as PostNewtonian,
+    PrecessionPotential as PrecessionPotential,
     Relativity as Relativity,
 )

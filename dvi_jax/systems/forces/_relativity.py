@@ -36,6 +36,26 @@ class Relativity(Central):
         return size * ((4 * mu / distance - v2) * r + 4 * rv * v)
 
 
+class PrecessionPotential(Central):
+    r"""A potential with the relativistic precession of the pericentre, in explicit steps.
+
+        Φ = −3 μ²/(c² r²),    a = −6 μ² r/(c² r⁴),    ϖ advances by 6π μ/(c² p) in a revolution
+
+    - `c`: the velocity of light [length/time], a number or a function of args.
+
+    The mean motion and the effects of velocities are not those of `Relativity`. The exact advance
+    is 2π (1 − 6 μ/(c² p))^{−1/2} − 2π, p = a (1 − e²) from the angular momentum.
+
+    **Source** Nobili & Roxburgh 1986, *IAU Symp.* 114, 105.
+    """
+
+    c: Any = quantity(positive)
+
+    def relative(self, t, r, v, mu, masses, args):
+        square = jnp.sum(r * r, -1, keepdims=True)
+        return -6 * (mu / (self.value("c", args, r) * square)) ** 2 * r
+
+
 class PostNewtonian(Force):
     r"""General relativity of all bodies to first order in 1/c²: Einstein, Infeld & Hoffmann.
 
