@@ -4,6 +4,7 @@ import copy
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -12,7 +13,7 @@ from lanewise.jaxprs.jaxapi import is_traced
 
 from ...base.checks import electronvolts, in_range, instance
 from ._maps import RingPart
-from ._optics import FRAMES, SLICED_PARTS, closed_orbit, one_turn, optics
+from ._optics import FRAMES, SLICED_PARTS, Optics, closed_orbit, one_turn, optics
 from ._radiation import ELECTRON, constants
 from ._ring import Ring, RingStructure, Where
 
@@ -155,10 +156,14 @@ def radiation_integrals(ring: Ring) -> Array:
         if len(tilts) and not is_traced(rolls := angle(ring.columns)[tilts]):
             hint = "The radiation integrals are those of a flat ring: use rings.equilibrium."
             in_range("roll of a bend", rolls, -0.01, 0.01, hint)
-    o = optics(ring, 0.0, chromatic=False)
-    L, h, b1, edge_in, edge_out = (
-        ring.columns[n][i] for n in ("length", "h", "b1", "edge_in", "edge_out")
-    )
+    names = "length", "h", "b1", "edge_in", "edge_out"
+    return _integrals([ring.columns[name] for name in names], optics(ring, 0.0, chromatic=False), i)
+
+
+@jax.jit
+def _integrals(columns: list[Array], o: Optics, i: Any) -> Array:
+    """`radiation_integrals` of the elements i, in one program."""
+    L, h, b1, edge_in, edge_out = (column[i] for column in columns)
     edge_in, edge_out = h * jnp.tan(edge_in), h * jnp.tan(edge_out)
     # Inside of the edges.
     beta, (d, slope), (d_out, slope_out) = (
