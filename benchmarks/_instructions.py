@@ -71,10 +71,8 @@ def parsed(text: str) -> Instruction | None:
     sizes = [SIZES[size] for size in re.findall(r"%([xyz]mm)", rest)]
     if not sizes and not name.startswith("k"):
         return None
-    is_single = (
-        not sizes
-        or ("broadcast" not in name
-        and bool(re.search(r"[sh][ds]$|s[ds]2|2s[ds]|vmovq|vmovd$", name)))
+    is_single = not sizes or (
+        "broadcast" not in name and bool(re.search(r"[sh][ds]$|s[ds]2|2s[ds]|vmovq|vmovd$", name))
     )
     size = 8 if is_single else max(sizes)
     *before, last = operands
@@ -86,7 +84,7 @@ def parsed(text: str) -> Instruction | None:
     loaded = 8 if "{1to" in rest or "broadcast" in name else size
     return Instruction(
         "none" if is_zero else unit,
-        "single" if is_single else "vector",
+        "vector" if size > 16 else "single",
         size // 8,
         loaded if any("(" in operand for operand in before) else 0,
         size if "(" in last else 0,
@@ -194,12 +192,10 @@ def with_probes(probes: Probes, ir: str) -> bytes:
         return target.read_bytes()
 
 
-def baseline_with_probes(probes: Probes) -> Baseline:
-    """baseline.c with probes."""
-    plain = Baseline()
+def baseline_with_probes(probes: Probes, command: list[str]) -> Baseline:
+    """baseline.c, compiled by a command, with probes."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "baseline.s"
-        flags = ["-mno-red-zone", *(["-DHAVE_LIBMVEC"] if plain.has_libmvec else [])]
-        subprocess.run([*plain.command, *flags, "-S", SOURCE, "-o", source], check=True)
+        subprocess.run([*command, "-mno-red-zone", "-S", SOURCE, "-o", source], check=True)
         source.write_text(probes.into(source.read_text(encoding="utf-8")), encoding="utf-8")
         return Baseline(source)

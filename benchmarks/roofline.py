@@ -14,7 +14,7 @@ For each row that is a ratio of processor times, the command
    one trajectory every instruction waits, and the limit is the time of the longest chain of
    instructions that need each other's results.
 
-It requires an x86-64 processor, Linux and gcc.
+It requires an x86-64 processor with AVX, Linux and gcc.
 """
 
 import argparse
@@ -45,6 +45,7 @@ from lanewise.native import machine
 
 LIMITS = Path(__file__).with_name("limits.c")
 KINDS = ("vector", "single")
+SIDES = ("package", "reference")
 LEVELS = {"L1": 16 << 10, "L2": 512 << 10, "memory": 96 << 20}
 """Bytes of the arrays from which the bandwidth of a level of memory is measured."""
 
@@ -58,6 +59,9 @@ COUNTED_LANES = 64
 MEASURES = speed.batch_row, speed.last_axis_row, speed.one_row
 OWN_MEASURES = speed.gradient_row, speed.forward_mode_row
 """Rows relative to C, and rows relative to the package's own run without derivative."""
+
+LEAST_WORK = 4_000_000
+"""Steps of all trajectories in a call of these rows: of shorter calls, the start takes time."""
 
 # Counting
 
@@ -100,14 +104,18 @@ def counted(row: speed.Row, bench: speed.Bench, clock: CountingClock) -> list[di
     ]
 
 
-def count_rows(rows: list[speed.Row], latency: dict[str, float]) -> dict[str, Any]:
-    """{row: counts of both sides}. Code that this process compiles from now on has probes."""
+def count_rows(
+    rows: list[speed.Row], latency: dict[str, float], command: list[str]
+) -> dict[str, Any]:
+    """{row: counts of both sides}. Code that this process compiles from now on has probes.
+
+    `latency` is in nanoseconds by kind and unit; `command` compiles the code of C.
+    """
     probes = Probes()
     machine.object_code = functools.partial(with_probes, probes)
     lanewise.set_threads(1)
     clock = CountingClock(probes, latency)
-    bench = speed.Bench(clock)
-    bench.baseline = baseline_with_probes(probes)
+    bench = speed.Bench(clock, baseline=baseline_with_probes(probes, command))
     return {row.name: counted(row, bench, clock) for row in rows}
 
 
@@ -194,8 +202,11 @@ def bounds(count: dict[str, float], cost: dict[str, float]) -> dict[str, float]:
 
 def compared(row: speed.Row, bench: speed.Bench, counts: list[dict[str, float]]) -> dict[str, Any]:
     """A row of the report: times, limits and counts of both sides for a step of a trajectory."""
-    settings = measure_of(row).keywords
-    row.measure(bench)
+    measure = measure_of(row)
+    settings = dict(measure.keywords)
+    if measure.func in OWN_MEASURES:
+        settings["steps"] = max(settings["steps"], LEAST_WORK // settings["lanes"])
+    measure.func(bench, **settings)
     clock = bench.clock
     assert isinstance(clock, LimitClock)
     lanes = settings.get("lanes", 1)
@@ -208,7 +219,7 @@ def compared(row: speed.Row, bench: speed.Bench, counts: list[dict[str, float]])
         written = cost["write L2"]
     memory = (start * cost["read L2"] + clock.bytes * written) / work
     sides = {}
-    for side, count, seconds in zip(("package", "reference"), counts, clock.least, strict=False):
+    for side, count, seconds in zip(SIDES, counts, clock.least, strict=False):
         units = bounds(count, cost) | {"memory": memory}
         unit = max(units, key=lambda name: units[name])
         if lanes == 1 and count["chain"] > units[unit]:
@@ -218,7 +229,7 @@ def compared(row: speed.Row, bench: speed.Bench, counts: list[dict[str, float]])
         sides[side] = {"time": 1e9 * seconds / work, **side_limit}
     return {
         "row": row.name,
-        "is_to_c": measure_of(row).func not in OWN_MEASURES,
+        "is_to_c": measure.func not in OWN_MEASURES,
         "bytes": (start + clock.bytes) / work,
         "costs": cost,
         **sides,
@@ -228,8 +239,8 @@ def compared(row: speed.Row, bench: speed.Bench, counts: list[dict[str, float]])
 # The report
 
 HEAD = (
-    "| row | operations, C | of the package | limit (ns) | unit | C / limit | package / limit "
-    "| package / its own limit |\n|---|---|---|---|---|---|---|---|"
+    "| row | operations, C | dvi_jax | limit (ns) | unit | C / limit | dvi_jax / limit "
+    "| dvi_jax / its limit | or its chain |\n|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -247,14 +258,17 @@ def lowest(result: dict[str, Any]) -> dict[str, Any]:
 def line(result: dict[str, Any]) -> str:
     package, reference, limit = result["package"], result["reference"], lowest(result)
     cells = [result["row"], f"{operations(reference):.0f}", f"{operations(package):.0f}"]
-    cells += [f"{limit['limit']:.3g}", limit["unit"]]
+    has_calls = any(limit["counts"].get(call) for call in CALLS)
+    cells += [f"{limit['limit']:.3g}", limit["unit"] + ", sin, cos" * has_calls]
     cells += [
         f"{reference['time'] / limit['limit']:.2f}",
         f"{package['time'] / limit['limit']:.2f}",
     ]
     if not result["is_to_c"]:
         cells[1] = cells[5] = "–"
-    return "| " + " | ".join([*cells, f"{package['time'] / package['limit']:.2f}"]) + " |"
+    longest = max(package["limit"], package["bounds"]["chain"])
+    cells += [f"{package['time'] / slowest:.2f}" for slowest in (package["limit"], longest)]
+    return "| " + " | ".join(cells) + " |"
 
 
 def as_text(report: dict[str, Any]) -> str:
@@ -271,54 +285,46 @@ def picture(report: dict[str, Any], path: Path) -> None:
     """Operations per second under the roofs, and times relative to the limit."""
     results = report["rows"]
     with plot.style():
-        size = (10, 1.6 + 0.21 * len(results))
+        size = (10, 1.6 + 0.2 * len(results))
         figure, (left, right) = plt.subplots(1, 2, figsize=size, width_ratios=(4, 5))
         _roofs(left, report["costs"], report["width"])
-        for side, colour, name in (("reference", "C1", "C"), ("package", "C0", "dvi_jax")):
+        for side, look, name in (("reference", "C1o", "C"), ("package", "C0s", "dvi_jax")):
             shown = [r for r in results if side == "package" or r["is_to_c"]]
-            counts = np.array([operations(r[side]) for r in shown])
-            at = counts / [r["bytes"] for r in shown], counts / [r[side]["time"] for r in shown]
-            left.loglog(*at, "os"[side == "package"], color=colour, label=name)
             ratios = [r[side]["time"] / lowest(r)["limit"] for r in shown]
-            right.semilogx(
-                ratios,
-                [results.index(r) for r in shown],
-                "os"[side == "package"],
-                color=colour,
-                label=name,
-            )
+            right.semilogx(ratios, [results.index(r) for r in shown], look, label=name)
+            batches = [r for r in shown if not r["row"].startswith("one trajectory")]
+            counts = np.array([operations(r[side]) for r in batches])
+            bytes_, times = np.transpose([(r["bytes"], r[side]["time"]) for r in batches])
+            left.loglog(counts / bytes_, counts / times, look, label=name)
         own = [r["package"]["limit"] / lowest(r)["limit"] for r in results]
-        right.semilogx(
-            own,
-            range(len(results)),
-            "|",
-            color="k",
-            ms=9,
-            label="limit of the operations of dvi_jax",
-        )
+        right.semilogx(own, range(len(own)), "k|", ms=9, label="limit of dvi_jax's operations")
         right.axvspan(1, 1.3, color="0.9", lw=0, zorder=0)
         right.set_yticks(range(len(results)), [r["row"] for r in results], fontsize=8)
         right.set(ylim=(len(results) - 0.4, -0.6), xlabel="time / limit")
         ticks = (1, 1.5, 2, 3, 5, 10)
-        right.set_xticks(ticks, map(str, ticks), minor=False)
+        right.set_xticks(ticks, map(str, ticks))
         right.set_xticks([], minor=True)
-        right.legend(loc="lower right", frameon=True)
-        left.legend(loc="lower right")
+        right.legend(loc="upper right", frameon=True)
+        left.legend(loc="lower right", frameon=True)
         figure.savefig(path)
         plt.close(figure)
 
 
 def _roofs(ax: Any, costs: dict[str, float], width: int) -> None:
     """The largest rate of operations for a number of operations per byte."""
-    intensity = np.geomspace(0.3, 3e4, 200)
+    intensity = np.geomspace(0.2, 1e4, 400)
     top = width / costs["vector rate mix"]
     new = min(costs["write new memory"], costs["stream new memory"])
     for name, cost in (("L2 cache", costs["write L2"]), ("new memory", new)):
         ax.loglog(intensity, np.minimum(top, intensity / cost), color="0.4", lw=1)
-        ax.annotate(name, (0.4, 0.45 / cost), rotation=40, fontsize=8, color="0.3")
-    ax.annotate("multiply-adds of vectors", (intensity[-1], 1.1 * top), ha="right", fontsize=8)
-    ax.set_xlabel("operations per byte of inputs and outputs")
+        height = (0.75 if name == "L2 cache" else 0.45) * top
+        white = {"fc": "white", "ec": "none", "pad": 1}
+        ax.annotate(name, (1.2 * height * cost, height), va="top", fontsize=8, bbox=white)
+    ax.annotate("multiply-adds of vectors", (intensity[-1], 1.03 * top), ha="right", fontsize=8)
+    ax.set(ylim=(4, 1.2 * top), xlabel="operations per byte of inputs and outputs")
     ax.set_ylabel("operations per nanosecond")
+    ax.set_yticks((5, 10, 20, 50), ("5", "10", "20", "50"))
+    ax.set_yticks([], minor=True)
 
 
 # The command
@@ -330,10 +336,15 @@ def rows_of(patterns: list[str] | None) -> list[speed.Row]:
     return [row for row in rows if measure_of(row).func in (*MEASURES, *OWN_MEASURES)]
 
 
-def counts_of(patterns: list[str] | None, latency: dict[str, float]) -> dict[str, Any]:
+def command_of(baseline: Baseline) -> list[str]:
+    """The words that compile the code of C as this library was compiled."""
+    return [*baseline.command, *(["-DHAVE_LIBMVEC"] if baseline.has_libmvec else [])]
+
+
+def counts_of(*arguments: Any) -> dict[str, Any]:
     """The result of `count_rows` in a process of its own, in which the code has probes."""
     done = subprocess.run(
-        [sys.executable, __file__, "--count", json.dumps([patterns, latency])],
+        [sys.executable, __file__, "--count", json.dumps(arguments)],
         stdout=subprocess.PIPE,
         check=True,
         text=True,
@@ -349,6 +360,7 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, help="folder for JSON and a picture; its other rows stay"
     )
+    parser.add_argument("--counts", type=Path, help="the JSON whose counts are used again")
     parser.add_argument("--count", help=argparse.SUPPRESS)
     options = parser.parse_args(words)
     if platform.machine() != "x86_64" or sys.platform != "linux":
@@ -358,11 +370,10 @@ def main(words: list[str] | None = None) -> int:
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_enable_x64", True)
     if options.count:
-        patterns, latency = json.loads(options.count)
-        print(json.dumps(count_rows(rows_of(patterns), latency)))
+        patterns, *others = json.loads(options.count)
+        print(json.dumps(count_rows(rows_of(patterns), *others)))
         return 0
-    bench = speed.Bench(speed.Clock(options.rounds, options.budget))
-    bench.baseline = Baseline(LIMITS)
+    bench = speed.Bench(speed.Clock(options.rounds, options.budget), baseline=Baseline(LIMITS))
     limits = Limits(bench.baseline.library, bench.baseline.width)
     alone = speed.Clock(options.rounds, options.budget).times(*limits.calls.values())
     costs = limits.costs(alone.processor.min(axis=0))
@@ -371,7 +382,11 @@ def main(words: list[str] | None = None) -> int:
     }
     latency |= {f"{kind} {f}": costs[f"{kind} rate {f}"] for kind in KINDS for f in CALLS}
     speed.say(f"# {speed.processor()}, {pinned}; C: {bench.baseline}")
-    counts = counts_of(options.rows, latency)
+    if options.counts:
+        rows = json.loads(options.counts.read_text(encoding="utf-8"))["rows"]
+        counts = {r["row"]: [r[side]["counts"] for side in SIDES] for r in rows}
+    else:
+        counts = counts_of(options.rows, latency, command_of(bench.baseline))
     limits.only(r"rate|L[12]|new")
     bench.clock = LimitClock(limits, options.rounds, options.budget)
     report = {"machine": speed.processor(), "width": bench.baseline.width, "costs": costs}

@@ -143,9 +143,15 @@ def ratio(times: Times, work: tuple[float, float] = (1.0, 1.0), **details) -> Me
 class Bench:
     """A clock, the C library, the axis of the trajectories and the cores: shared by the rows."""
 
-    def __init__(self, clock: Clock, axis: int = 0, cores: tuple[int, ...] = (0,)):
+    def __init__(
+        self,
+        clock: Clock,
+        axis: int = 0,
+        cores: tuple[int, ...] = (0,),
+        baseline: Baseline | None = None,
+    ):
         self.clock, self.axis, self.cores = clock, axis, cores
-        self.baseline = Baseline()
+        self.baseline = Baseline() if baseline is None else baseline
 
     def against_c(self, f, inputs, c_run, **details) -> Measured:
         """Time of the jitted f over that of the kernel, and the first call of f."""

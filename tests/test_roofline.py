@@ -37,7 +37,7 @@ def instructions(monkeypatch):
         ("vmovupd %zmm1, 64(%rsp)", ("none", "vector", 8, 0, 64, {"1"}, "64(%rsp)")),
         ("vmovntpd %zmm1, (%rax,%rcx)", ("none", "vector", 8, 0, 64, {"1"}, "")),
         ("vbroadcastsd 8(%rax), %zmm1", ("none", "vector", 8, 8, 0, set(), "1")),
-        ("vxorpd %xmm1, %xmm1, %xmm1", ("none", "vector", 2, 0, 0, set(), "1")),
+        ("vxorpd %xmm1, %xmm1, %xmm1", ("none", "single", 2, 0, 0, set(), "1")),
         ("vpternlogq $4, %zmm1, %zmm2, %zmm3", ("other", "vector", 8, 0, 0, {"1", "2"}, "3")),
         ("call _ZGVeN8v_sin@PLT", ("sin", "vector", 8, 0, 0, {"0"}, "0")),
     ],
@@ -93,7 +93,8 @@ CHILD = """
         speed.Row(name, None, functools.partial(speed.batch_row, name=name, lanes=64, steps=1))
         for name in ("oscillator", "larger", "kepler", "product")
     ]
-    print(json.dumps(roofline.count_rows(rows, {"vector fma": 1.0})))
+    command = roofline.command_of(roofline.Baseline())
+    print(json.dumps(roofline.count_rows(rows, {"vector fma": 1.0}, command)))
 """
 
 
