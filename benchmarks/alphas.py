@@ -1,6 +1,7 @@
 """Guiding centres of alpha particles: this package and simsopt, on the same field and starts.
 
     pip install "dvi-jax[peers]"; python benchmarks/alphas.py [--quick] [--check] [--long]
+    python benchmarks/alphas.py --wout FILE
 
 Both follow 3.5 MeV alpha particles in Boozer coordinates of one vacuum field: |B| of precise_qa,
 given to simsopt as a field of its own class and then interpolated by simsopt (48³ cells of degree
@@ -10,7 +11,9 @@ given to simsopt as a field of its own class and then interpolated by simsopt (4
 2. losses: the same starts, both loss fractions, the particles that differ,
 3. time: processor time per particle for 0.1 s against the largest error of the energy, on one
    core: simsopt for several tolerances, this package for several steps, in a batch and alone,
-4. `--long`: 1000 alphas for 0.2 s on all cores, and no secular drift over 10⁵ bounces.
+4. `--long`: 1000 alphas for 0.2 s on all cores, and no secular drift over 10⁵ bounces,
+5. `--wout FILE`, alone: an equilibrium of VMEC, read by `read_vmec` (packages booz_xform, netCDF4):
+   differences of |B| and ι between fields from few surfaces and the field from all of them.
 
 `--check` exits with status 1 if a result is outside of its limit. Without simsopt only the rows of
 this package are printed.
@@ -294,11 +297,34 @@ def many_bounces(particles, bounces=100_000):
     return abs(slope) / error
 
 
+def few_surfaces(path):
+    """Table 5: the field of all surfaces."""
+    settings = {"modes": (16, 12), "box": (8, 6), "tolerance": 1.0}
+    field, geometry = boozer.read_vmec(path, **settings)
+    points = np.random.default_rng(1).uniform([0.02, 0, 0], [0.98, 2 * np.pi, 2 * np.pi], (4000, 3))
+
+    def values(field):
+        strength = field.strength(*points.T) / field.average
+        return np.asarray(strength), np.asarray(polynomial(field.iota, points[:, 0]))
+
+    whole = values(field)
+    print(f"5. {path}: largest differences from the field of all surfaces, |B|/mean and ι")
+    for count in (5, 8, 12, 16):
+        few = values(boozer.read_vmec(path, surfaces=count, **settings)[0])
+        B, iota = (np.abs(a - b).max() for a, b in zip(few, whole, strict=True))
+        print(f"   about {count} surfaces: {B:.1e}, {iota:.1e}")
+    return field, geometry
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for option in ("--quick", "--check", "--long"):
         parser.add_argument(option, action="store_true")
+    parser.add_argument("--wout", metavar="FILE")
     options = parser.parse_args()
+    if options.wout:
+        few_surfaces(options.wout)
+        return
     particles = particles_of("precise_qa")
     count, seconds, cells = (8, 1e-3, 16) if options.quick else (16, 0.1, 48)
     wrong = []

@@ -366,9 +366,9 @@ def test_shipped_fields_against_the_equilibria(name):
     assert np.abs(np.asarray(FIELDS[name]().strength(s, theta, -zeta)) - B).max() > 2 * tolerance
 
 
-def written(path, sign=1, drop=(), B00=5.7):
+def written(path, sign=1, drop=(), B00=5.7, surfaces=11):
     """A file as booz_xform writes it; `sign`: of the toroidal flux."""
-    surfaces, modes = 11, [(0, 0), (0, 4), (1, -4), (1, 0), (2, 4)]
+    modes = [(0, 0), (0, 4), (1, -4), (1, 0), (2, 4)]
     s = (np.arange(2, surfaces + 1) - 1.5) / (surfaces - 1)
     B = np.array([B00 + 0 * s, 0.02 * s, 0.03 * s**0.5, -0.5 * s**0.5, 0.1 * s]).T
     profile = np.concatenate([[0.0], 0.4 + 0.1 * s])

@@ -62,6 +62,7 @@ EXAMPLES = {
     "alpha_invariants.py": ("alpha-particles", "alpha_invariants.png"),
     "alpha_optimise.py": ("alpha-particles", "alpha_optimise.png"),
     "alpha_collisions.py": ("alpha-particles", ""),
+    "alpha_walls.py": ("alpha-particles", "alpha_walls.png"),
     "code_generation.py": ("lanewise", "code_generation.png"),
     "own_system.py": ("command-line", ""),
     "kepler.toml": ("command-line", "run trajectory.png"),
