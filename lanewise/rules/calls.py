@@ -38,6 +38,7 @@ def _call(evaluator: Evaluator, eqn: Any, values: Values, places: list) -> Value
     if evaluator.module.platform != "cpu":
         outs = evaluator.evaluate(body, [evaluator.opaque(v) for v in inputs])
         return [evaluator.opaque(v) for v in outs]
+    # Known numbers are a part of the function: products with zeros and ones are not written.
     numbers = [x for v in inputs for x in v.entries.flat]
     kinds = tuple((x.dtype, x.vec) if x.value is None else x.key for x in numbers)
     key = body.jaxpr, kinds, tuple(v.is_tangent for v in inputs)
@@ -71,6 +72,7 @@ def _write(module: Module, body: ClosedJaxpr, inputs: Values) -> _Function:
         arguments[-1].is_tangent = value.is_tangent
     outs = evaluator.evaluate(body, arguments)
     results = [x for out in outs for x in evaluator.entries(out).flat]
+    # In memory, not in a structure: its type would be written again with each of its numbers.
     for k, x in enumerate(x for x in results if x.value is None):
         place = b.pointer("i8", "%scratch", inner.scratch_bytes + k * _SIZE * b.W)
         b.emit(f"store {b.type(x.dtype, x.vec)} {x.names[0]}, ptr {place}")
@@ -88,6 +90,7 @@ def _results(evaluator: Evaluator, function: _Function, numbers: Sequence[Num]) 
     size = function.scratch_bytes // _SIZE + len(moving) * b.W
     memory = module.scratch((size,), "float64", False).base[0]
     counts = [f"i64 {module.parameter(n).names[0]}" for n in function.values]
+    # One vector after the other: a long function has enough independent operations.
     names: list[list[str]] = [[] for _ in moving]
     for u in range(b.U if any(x.vec for x in numbers) else 1):
         arguments = [
