@@ -26,7 +26,7 @@ class Module:
         self.values: list[int] = []
         self.globals: list[str] = []
         self.functions: dict[tuple[str, int], str] = {}
-        self.repeated_functions: frozenset[Any] = frozenset()  # the jaxprs of which one is written
+        self.calls: dict[Any, int] = {}  # of the jaxprs of functions marked by `once`
         self.written_functions: dict[Any, Any] = {}
         self.declarations: set[str] = set()
         self.scratch_bytes = 0
@@ -37,7 +37,7 @@ class Module:
         inner = type(self)(self.b.W, 1)
         inner.globals, inner.functions = self.globals, self.functions
         inner.declarations, inner._constants = self.declarations, self._constants
-        inner.repeated_functions = self.repeated_functions
+        inner.calls = self.calls
         inner.written_functions = self.written_functions
         inner.b.limit = self.b.limit
         return inner

@@ -1,4 +1,4 @@
-"""Functions that a program calls several times are written once, with the numbers of XLA."""
+"""Marked functions that a program calls several times are written once, with XLA's numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -7,13 +7,13 @@ from jax import lax
 from test_lanewise_threads import assert_same_bits, by_numbers, by_threads
 
 import lanewise
-from lanewise.targets import numbers
+from lanewise.rules import calls
 
 TABLE = jnp.linspace(0.5, 1.5, 200)  # an array in memory
 LANES = 19
 
 
-@jax.jit
+@lanewise.once
 def inner(x):
     """A function that a large one calls twice."""
     for _ in range(31):
@@ -21,7 +21,7 @@ def inner(x):
     return x
 
 
-@jax.jit
+@lanewise.once
 def large(x, scale, count, flag):
     """A function with a table, a loop, a branch, and results of all kinds."""
     y = inner(inner(jnp.sin(x) * scale) + TABLE[count])
@@ -70,7 +70,7 @@ def test_a_repeated_function_is_written_once(monkeypatch):
     # A different text for constants and for numbers of a trajectory: fewer than calls.
     functions = text.count("define internal void @function")
     assert 1 < functions < text.count("call void @function")
-    monkeypatch.setattr(numbers, "LARGE", 10**9)
+    monkeypatch.setattr(calls, "is_once", lambda eqn: False)
     (inline,) = texts()
     assert "@function" not in inline
     assert len(text.splitlines()) < 0.8 * len(inline.splitlines())
@@ -92,6 +92,22 @@ def test_bits_do_not_depend_on_the_batch():
         np.testing.assert_array_equal(one, others[i])
 
 
+def test_another_call_changes_no_bit(monkeypatch):
+    """Such as that of an observable; the control is without a border for one call."""
+    marked = lanewise.once(lambda x: (x * x) * x)
+
+    def one(x):
+        return marked(x * x) + x
+
+    def two(x):
+        return one(x), marked(x)
+
+    x, before = INPUTS[0], lanewise.batched(one)(INPUTS[0])
+    np.testing.assert_array_equal(before, lanewise.batched(two)(x)[0])
+    monkeypatch.setattr(calls, "is_once", lambda eqn: False)
+    assert np.any(before != lanewise.batched(lambda x: one(x) + 0)(x))
+
+
 def test_threads_of_a_gpu_have_the_bits_of_the_cpu():
     """There the function is a part of its caller, and no product crosses its border either."""
 
@@ -111,7 +127,7 @@ def test_a_gradient_of_repeated_functions():
 
         return lanewise.batched(one)(x).sum(), jax.vmap(one)(x).sum()
 
-    @jax.jit
+    @lanewise.once
     def small(x):
         for _ in range(40):
             x = x + 0.05 * jnp.sin(jnp.roll(x, 1))

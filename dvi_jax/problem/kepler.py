@@ -77,8 +77,8 @@ class _Orbit(NamedTuple):
         return step, past, is_last & (jnp.abs(self.beta) * newton * newton <= _SHORT)
 
 
-# Jitted, so that all calls in a run share one trace, and one trace of the derivative.
-@jax.jit
+# All calls in a run share one trace and one trace of the derivative, and are written once.
+@lanewise.once
 def change(h: Scalar, q: Array, v: Array, mu: Array) -> tuple[Array, Array, Array]:
     r"""The changes of position and velocity on Kepler orbits over the time h.
 

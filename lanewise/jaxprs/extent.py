@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ..llvm.ir import MOST_OPERATIONS
-from .jaxapi import ClosedJaxpr, bodies, scan_counts
+from .jaxapi import ClosedJaxpr, bodies, is_once, scan_counts
 
 
 def functions_in(eqn: Any) -> list[ClosedJaxpr]:
@@ -72,19 +72,22 @@ def operation_count(jaxpr: Any) -> int:
     return sum(_operations(eqn) for eqn in _innermost(jaxpr))
 
 
-def repeated_functions(jaxpr: Any, size: int) -> frozenset[Any]:
-    """The jaxprs of at least so many operations that a function calls in more than one place."""
+def calls_of_marked(jaxpr: Any) -> dict[Any, int]:
+    """The jaxprs of functions marked by `once`, and in how many places they are called."""
     places: dict[Any, int] = {}
+    seen: set[Any] = set()
 
     def count(jaxpr: Any) -> None:
-        for function in (f.jaxpr for eqn in jaxpr.eqns for f in _evaluated(eqn)):
-            places[function] = places.get(function, 0) + 1
-            if places[function] == 1:
-                count(function)
+        for eqn in jaxpr.eqns:
+            for function in (f.jaxpr for f in _evaluated(eqn)):
+                if is_once(eqn):
+                    places[function] = places.get(function, 0) + 1
+                if function not in seen:
+                    seen.add(function)
+                    count(function)
 
     count(jaxpr)
-    repeated = (function for function, number in places.items() if number > 1)
-    return frozenset(function for function in repeated if operation_count(function) >= size)
+    return places
 
 
 def largest_bytes(jaxpr: Any) -> int:

@@ -1,5 +1,6 @@
 """The few names of JAX that have moved between releases, or are not public: all of them, here."""
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -25,6 +26,30 @@ from jax.sharding import NamedSharding, PartitionSpec
 def is_traced(x: object) -> bool:
     """Whether the value of `x` is not known yet (inside jit, vmap, grad, …)."""
     return isinstance(x, Tracer)
+
+
+_ONCE = "_written_once"
+
+
+def once(function: Callable) -> Callable:
+    """`function`, compiled by JAX, and written once in machine code for its calls of one kind.
+
+    For functions of at least some hundreds of operations. No product of it is contracted with a sum
+    outside of it, called once or more often.
+    """
+
+    @functools.wraps(function)
+    def marked(*arguments: Any) -> Any:
+        return function(*arguments)
+
+    # The name is what the derivatives and batches that JAX makes of the function keep.
+    marked.__name__ = function.__name__ + _ONCE
+    return jax.jit(marked)
+
+
+def is_once(eqn: Any) -> bool:
+    """Whether an equation is the call of a function marked by `once`, or of a derivative of it."""
+    return str(eqn.params.get("name", "")).endswith(_ONCE)
 
 
 def batch_size(values: Iterable[Any]) -> tuple[int, bool, bool]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..evaluator import RULES, Evaluator
-from ..jaxprs.jaxapi import ClosedJaxpr, bodies
+from ..jaxprs.jaxapi import ClosedJaxpr, bodies, is_once
 from ..llvm.ir import Num
 from ..llvm.values import SMALL, Value, Values, objects
 from ..module import Module
@@ -29,17 +29,18 @@ class _Function:
 def _call(evaluator: Evaluator, eqn: Any, values: Values, places: list) -> Values:
     (body,) = bodies(eqn)
     is_long = any(v.entries is None and v.size > SMALL for v in values)
-    if is_long or body.jaxpr not in evaluator.module.repeated_functions:
+    if is_long or not is_once(eqn):
         return evaluator.evaluate(body, values, places)
-    # In a function of its own, no product is contracted with a sum outside; the same everywhere.
+    # In a function of its own, no product is contracted with a sum outside: the same everywhere,
+    # so that another call, of an observable for example, changes no bit of this one.
     inputs = [evaluator.value([*evaluator.entries(v).flat], v) for v in values]
     for new, old in zip(inputs, values, strict=True):
         new.is_tangent = old.is_tangent
-    if evaluator.module.platform != "cpu":
+    if evaluator.module.calls.get(body.jaxpr, 1) == 1 or evaluator.module.platform != "cpu":
         outs = evaluator.evaluate(body, [evaluator.opaque(v) for v in inputs])
         return [evaluator.opaque(v) for v in outs]
     # Known numbers are a part of the function: products with zeros and ones are not written.
-    numbers = [x for v in inputs for x in v.entries.flat]
+    numbers = [x for v in inputs for x in evaluator.entries(v).flat]
     kinds = tuple((x.dtype, x.vec) if x.value is None else x.key for x in numbers)
     key = body.jaxpr, kinds, tuple(v.is_tangent for v in inputs)
     written = evaluator.module.written_functions
@@ -67,6 +68,7 @@ def _write(module: Module, body: ClosedJaxpr, inputs: Values) -> _Function:
 
     arguments = []
     for value in inputs:
+        assert value.entries is not None
         entries = objects([argument(x) for x in value.entries.flat], value.shape)
         arguments.append(Value(value.shape, value.dtype, entries))
         arguments[-1].is_tangent = value.is_tangent

@@ -10,11 +10,11 @@ from .. import rules as rules  # each file registers its rules with the evaluato
 from ..evaluator import RULES, Evaluator
 from ..frame import kernel_text, pointers
 from ..jaxprs.extent import (
+    calls_of_marked,
     carry_size,
     most_operations,
     operation_count,
     primitives_in,
-    repeated_functions,
 )
 from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import check_size, check_that, check_type
@@ -99,10 +99,6 @@ def operand_value(evaluator: Evaluator, buffer: Buffer) -> Value:
 
 _LONG_PROGRAM = 10_000  # operations
 
-LARGE = 600
-"""Operations of a function from which it is written once for all its calls. A round on assumptions
-is shorter: it has no such call."""
-
 
 class Numbers:
     """Number by number, in vectors of trajectories; it is tried for every program."""
@@ -133,7 +129,7 @@ class Numbers:
             vectors = vectors_for(state, count) if state or size <= 24 else 1
         module = Module(*variant(lanes, vectors))
         module.b.limit = limit
-        module.repeated_functions = repeated_functions(function.jaxpr, LARGE)
+        module.calls = calls_of_marked(function.jaxpr)
         text = kernel_of(module, function, lane_flags)
         b, values, scratch = module.b, tuple(module.values), module.scratch_bytes
         return Code(text, b.W * b.U, values, (), b.operations, scratch, b.W, b.U)

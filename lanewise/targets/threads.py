@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from ..evaluator import Evaluator
-from ..jaxprs.extent import has_long_arrays, operation_count, repeated_functions
+from ..jaxprs.extent import calls_of_marked, has_long_arrays, operation_count
 from ..jaxprs.jaxapi import ClosedJaxpr
 from ..llvm.ir import Num, check_size, check_that, check_type
 from ..llvm.memory import Buffer, contiguous, stored_type
@@ -26,7 +26,7 @@ from ..llvm.ptx import (
     ptx_text,
 )
 from ..module import Module
-from .numbers import LARGE, array_at, lane_stride, operand_value
+from .numbers import array_at, lane_stride, operand_value
 from .target import Code
 
 NAME = "lanewise_kernel"
@@ -181,7 +181,7 @@ class Threads:
         check_size(count, MOST_OPERATIONS, "the number of operations of a GPU thread")
         check_that(not has_long_arrays(jaxpr), "arrays of a loop are too long for a GPU thread")
         module = ThreadModule()
-        module.repeated_functions = repeated_functions(jaxpr, LARGE)
+        module.calls = calls_of_marked(jaxpr)
         text = function_text(module, function, lane_flags)
         pointers = len(jaxpr.invars), len(jaxpr.outvars)
         parameters = sum(pointers) + 1 + len(module.values)
