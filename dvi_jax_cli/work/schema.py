@@ -54,17 +54,6 @@ Parameter = TypeAliasType(
     "Parameter", union(boolean=bool, number=toml.Scalar, array=Array, table=dict[str, "Parameter"])
 )
 
-ForceValue = TypeAliasType(
-    "ForceValue",
-    union(
-        boolean=bool,
-        number=toml.Scalar,
-        array=NonEmpty["ForceValue"],
-        text=Text,
-        table=dict[str, "ForceValue"],
-    ),
-)
-
 
 class State(TomlTable):
     """The initial condition."""
@@ -87,7 +76,7 @@ class SystemFile(TomlTable):
     ring: RingFile | None = key(None, "a table with file = …; for system = ring")
     state: State = State()
     args: dict[str, Parameter] | None = key(None, ARGS)
-    force: NonEmpty[dict[str, ForceValue]] | None = key(
+    force: NonEmpty[dict[str, toml.AnyValue]] | None = key(
         None, "tables [[force]] with name = a class of dvi.forces, and its parameters"
     )
     t0: Number = key(0.0, FINITE)

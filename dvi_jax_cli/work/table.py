@@ -191,6 +191,18 @@ else:
 
 NumberOrArray = union(number=Number, array=Array)
 
+AnyValue = TypeAliasType(
+    "AnyValue",
+    union(
+        boolean=bool,
+        number=Scalar,
+        array=NonEmpty["AnyValue"],
+        text=Text,
+        table=dict[str, "AnyValue"],
+    ),
+)
+"""A parameter of a force: numbers, texts, arrays and tables of these."""
+
 
 # Axes of a sweep, in the place of numbers
 
