@@ -36,7 +36,7 @@ def add_forces(
         own[name] = args[name]
         return lambda args: args[name]
 
-    terms = []
+    terms: list[Any] = []
     for i, table in enumerate(tables):
         key, name = f"force[{i}]", table.get("name", "")
         defect = NO_KEY if "name" not in table else ""
@@ -48,7 +48,7 @@ def add_forces(
         with as_input_error(key, f"parameters of {name}: {one_of(names)}"):
             terms.append(CLASSES[name](**options))
     with as_input_error("force", "a system whose args are a table"):
-        return sum(terms).add_to(problem, args=own or None)
+        return sum(terms[1:], terms[0]).add_to(problem, args=own or None)
 
 
 def _numbers(key: str, text: str) -> Any:

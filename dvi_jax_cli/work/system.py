@@ -173,6 +173,7 @@ def find_source(file: SystemFile, folder: Path) -> Source:
     rule = "no forces for a dvi.System or a ring: they are added to a systems.Problem"
     fits = source.problem is not None and file.ring is None
     require(fits, "force", "it is given", rule)
+    assert source.problem is not None
     problem = add_forces(source.problem, file.force, file.args or {}, source.loader)
     return replace(source, problem=problem, system=problem.system)
 
