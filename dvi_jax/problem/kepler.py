@@ -155,6 +155,7 @@ def _slope(operands: list[Array], changes: dict[int, Array]) -> list[Array]:
     g, orbit = _G(*functions), _Orbit(*operands[5:9])
     beta, square = orbit.beta, X * X
     z = beta * square
+    # Next to a parabola the differences cancel: there the series.
     small = jnp.abs(z) <= _SERIES_UP_TO
     small_z, far_beta = jnp.where(small, z, 0.0), jnp.where(small, 1.0, beta)
     c4 = c5 = jnp.zeros_like(z)

@@ -1,8 +1,6 @@
 """Forces of `dvi.forces` from the tables [[force]] of a TOML file."""
 
-import functools
 import inspect
-import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -39,7 +37,7 @@ def add_forces(
         own[name] = args[name]
         return lambda args: args[name]
 
-    terms = []
+    terms: list[Any] = []
     for number, table in enumerate(tables):
         key, name = f"force[{number}]", table.get("name", "")
         defect = NO_KEY if "name" not in table else ""
@@ -52,7 +50,7 @@ def add_forces(
         with as_input_error(key, f"parameters of {name}: {one_of(names)}"):
             terms.append(CLASSES[name](**options))
     with as_input_error("force", "a system whose args are a table"):
-        return functools.reduce(operator.add, terms).add_to(problem, args=own or None)
+        return sum(terms[1:], terms[0]).add_to(problem, args=own or None)
 
 
 def _numbers(key: str, text: str) -> Any:

@@ -76,7 +76,7 @@ class SystemFile(TomlTable):
     ring: RingFile | None = key(None, "a table with file = …; for system = ring")
     state: State = State()
     args: dict[str, Parameter] | None = key(None, ARGS)
-    force: NonEmpty[dict[str, toml.ForceValue]] | None = key(
+    force: NonEmpty[dict[str, toml.AnyValue]] | None = key(
         None, "tables [[force]] with name = a class of dvi.forces, and its parameters"
     )
     t0: Number = key(0.0, FINITE)

@@ -183,16 +183,6 @@ NonEmpty = Annotated[list[V], Field(min_length=1)]
 Two = Annotated[list[V], Field(min_length=2, max_length=2)]
 
 Rows = TypeAliasType("Rows", union(number=Number, array=NonEmpty["Rows"]))
-ForceValue = TypeAliasType(
-    "ForceValue",
-    union(
-        boolean=bool,
-        number=Scalar,
-        array=NonEmpty["ForceValue"],
-        text=Text,
-        table=dict[str, "ForceValue"],
-    ),
-)
 if TYPE_CHECKING:
     Array = np.ndarray
 else:
@@ -200,6 +190,18 @@ else:
 """Nested arrays of finite numbers, all rows of one length, as an array of NumPy."""
 
 NumberOrArray = union(number=Number, array=Array)
+
+AnyValue = TypeAliasType(
+    "AnyValue",
+    union(
+        boolean=bool,
+        number=Scalar,
+        array=NonEmpty["AnyValue"],
+        text=Text,
+        table=dict[str, "AnyValue"],
+    ),
+)
+"""A parameter of a force: numbers, texts, arrays and tables of these."""
 
 
 # Axes of a sweep, in the place of numbers
