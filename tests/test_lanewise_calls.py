@@ -7,6 +7,7 @@ from jax import lax
 from test_lanewise_threads import assert_same_bits, by_numbers, by_threads
 
 import lanewise
+from lanewise.native import machine
 from lanewise.rules import calls
 
 TABLE = jnp.linspace(0.5, 1.5, 200)  # an array in memory
@@ -108,15 +109,36 @@ def test_another_call_changes_no_bit(monkeypatch):
     assert np.any(before != lanewise.batched(lambda x: one(x) + 0)(x))
 
 
+def product_and_sum():
+    """A program with two calls of one function, as the targets take it."""
+    function = jax.make_jaxpr(lambda x: inner(inner(x * x) + x) + x)(INPUTS[1])
+    return function, (True,), [INPUTS[0]], LANES
+
+
 def test_threads_of_a_gpu_have_the_bits_of_the_cpu():
     """There the function is a part of its caller, and no product crosses its border either."""
-
-    def product_and_sum(x):
-        return inner(inner(x * x) + x) + x
-
-    function = jax.make_jaxpr(product_and_sum)(INPUTS[1])
-    arguments = function, (True,), [INPUTS[0]], LANES
+    arguments = product_and_sum()
     assert_same_bits(by_threads(*arguments), by_numbers(*arguments))
+
+
+def test_the_passes_for_long_texts_change_no_bit(monkeypatch):
+    arguments = product_and_sum()
+    expected = by_numbers(*arguments)
+    # A loop-invariant load is moved by the passes for short texts only.
+    text = "define void @f(ptr noalias %a, ptr noalias %b, i64 %n) {\nentry:\n  br label %loop\n"
+    text += "loop:\n  %i = phi i64 [0, %entry], [%j, %loop]\n  %x = load double, ptr %a\n"
+    text += "  %p = getelementptr double, ptr %b, i64 %i\n  store double %x, ptr %p\n"
+    text += "  %j = add i64 %i, 1\n  %c = icmp slt i64 %j, %n\n"
+    text += "  br i1 %c, label %loop, label %end\nend:\n  ret void\n}\n"
+
+    def is_in_the_loop():
+        _, loop = str(machine.optimise(text, machine.target_machine())).split("loop:", 1)
+        return "load double" in loop
+
+    assert not is_in_the_loop()
+    monkeypatch.setattr(machine, "_LONG", 0)
+    assert is_in_the_loop()
+    assert_same_bits(by_numbers(*arguments), expected)
 
 
 def test_a_gradient_of_repeated_functions():

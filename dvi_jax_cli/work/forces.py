@@ -1,6 +1,8 @@
 """Forces of `dvi.forces` from the tables [[force]] of a TOML file."""
 
+import functools
 import inspect
+import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -50,7 +52,7 @@ def add_forces(
         with as_input_error(key, f"parameters of {name}: {one_of(names)}"):
             terms.append(CLASSES[name](**options))
     with as_input_error("force", "a system whose args are a table"):
-        return sum(terms[1:], terms[0]).add_to(problem, args=own or None)
+        return functools.reduce(operator.add, terms).add_to(problem, args=own or None)
 
 
 def _numbers(key: str, text: str) -> Any:

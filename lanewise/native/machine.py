@@ -9,7 +9,7 @@ from . import cache
 
 # Part of the name of each file in the cache: increase it with each change of what machine code
 # expects of the process around it, or processes would load code that does not fit.
-FORMAT = 3
+FORMAT = 4
 
 _lock = threading.RLock()
 
@@ -77,6 +77,10 @@ def target_machine(triple: str | None = None, cpu: str | None = None, features: 
     )
 
 
+_LONG = 2_000_000
+"""Characters of a text from which only the passes are run whose time is proportional to it."""
+
+
 def optimise(ir: str, machine: Any, level: int = 2, unroll: bool = False) -> Any:
     """A module after the passes that pay for code which is written number by number."""
     llvm = start_llvm()
@@ -88,7 +92,17 @@ def optimise(ir: str, machine: Any, level: int = 2, unroll: bool = False) -> Any
     options.slp_vectorization = options.loop_vectorization = False
     options.loop_unrolling = unroll
     builder = llvm.create_pass_builder(machine, options)
-    builder.getModulePassManager().run(module, builder)
+    if len(ir) < _LONG:
+        passes = builder.getModulePassManager()
+    else:
+        # Moving numbers out of loops takes minutes for thousands of weights, and they would have to
+        # wait in memory again.
+        passes = llvm.create_new_module_pass_manager()
+        passes.add_instruction_combine_pass()
+        passes.add_simplify_cfg_pass()
+        passes.add_new_gvn_pass()
+        passes.add_aggressive_dce_pass()
+    passes.run(module, builder)
     return module
 
 
