@@ -287,3 +287,16 @@ def test_the_reverse_gradient_of_a_run_whose_observable_is_a_number():
     assert jax.grad(loss)(jnp.ones(1))[0] == pytest.approx(
         float(loss(jnp.ones(1)) - 0.7), rel=1e-12
     )
+
+
+def test_a_drift_stays_nan():
+    """A NaN stays, whatever comes after it; an infinite value is a drift without bound."""
+    drift, nan, inf = dvi.MaxDrift(lambda q, p: q), np.nan, np.inf
+    cases = [([1, 3, 0], 2), ([1, nan, 5], nan), ([nan, 1, 1], nan), ([1, inf, 2], inf)]
+    for values, expected in [*cases, ([1, -inf, nan], nan), ([inf, 1, 1], nan), ([], nan)]:
+        memory = drift.start(jnp.asarray(0.0))
+        for k, value in enumerate(values):
+            memory = drift.update(
+                memory, jnp.asarray(k, jnp.int32), 0.1 * k, jnp.asarray(1.0 * value)
+            )
+        np.testing.assert_array_equal(drift.finish(memory), expected)

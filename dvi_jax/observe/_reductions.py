@@ -124,22 +124,25 @@ class MaxDrift(_OfFunction):
         return value, nan, jnp.zeros(value.shape, jnp.int32)
 
     def update(self, memory, k, t, value):
-        first, farthest, step = memory
-        first = jnp.where(k == 0, value, first)
+        first, size, step = memory
+        first, size = jnp.where(k == 0, value, first), jnp.where(k == 0, 0, size)
         far = _difference(value, first)
-        # A comparison with NaN is false: NaN, once stored, stays.
-        larger = (jnp.abs(far) > jnp.abs(farthest)) | jnp.isnan(far) | (k == 0)
-        return first, jnp.where(larger, far, farthest), jnp.where(larger, k, step)
+        # A comparison with NaN is false, and the sum is NaN with either: NaN, once stored, stays.
+        smaller = jnp.abs(far) <= size
+        size = jnp.where(smaller, size, jnp.abs(far) + 0 * size)
+        # The complement of a number says that the value has decreased.
+        return first, size, jnp.where(smaller, step, jnp.where(far < 0, ~k, k))
 
     def finish(self, memory):
-        first, farthest, _ = memory
-        return jnp.abs(farthest / first) if self.relative else jnp.abs(farthest)
+        first, size, _ = memory
+        return jnp.abs(size / first) if self.relative else size
 
     def combine(self, memory, k, t, value):
-        first, farthest, step = memory
+        first, size, step = memory
         # The number of the step decides: a rebuilt value is the largest one only up to rounding.
-        of_first = self.change(value, k == 0)
-        return first + of_first, farthest + self.change(value, k == step) - of_first, step
+        of_first, sign = self.change(value, k == 0), jnp.where(step < 0, -1, 1)
+        change = self.change(value, k == jnp.where(step < 0, ~step, step)) - of_first
+        return first + of_first, size + sign * change, step
 
 
 class Range(_OfFunction):
