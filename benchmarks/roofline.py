@@ -50,7 +50,7 @@ LEVELS = {"L1": 16 << 10, "L2": 512 << 10, "memory": 96 << 20}
 """Bytes of the arrays from which the bandwidth of a level of memory is measured."""
 
 NEW_BYTES = 32 << 20
-"""Bytes of an array that the process receives anew from the system."""
+"""Bytes of an array in memory that the system has just given to the process."""
 
 COUNTED_STEPS = (320, 640)
 """The counts are differences of two runs. Portions of 32 steps and of 10 saved rows divide both."""
@@ -287,7 +287,6 @@ def picture(report: dict[str, Any], path: Path) -> None:
     with plot.style():
         size = (10, 1.6 + 0.2 * len(results))
         figure, (left, right) = plt.subplots(1, 2, figsize=size, width_ratios=(4, 5))
-        _roofs(left, report["costs"], report["width"])
         for side, look, name in (("reference", "C1o", "C"), ("package", "C0s", "dvi_jax")):
             shown = [r for r in results if side == "package" or r["is_to_c"]]
             ratios = [r[side]["time"] / lowest(r)["limit"] for r in shown]
@@ -296,6 +295,7 @@ def picture(report: dict[str, Any], path: Path) -> None:
             counts = np.array([operations(r[side]) for r in batches])
             bytes_, times = np.transpose([(r["bytes"], r[side]["time"]) for r in batches])
             left.loglog(counts / bytes_, counts / times, look, label=name)
+        _roofs(left, report["costs"], report["width"])
         own = [r["package"]["limit"] / lowest(r)["limit"] for r in results]
         right.semilogx(own, range(len(own)), "k|", ms=9, label="limit of dvi_jax's operations")
         right.axvspan(1, 1.3, color="0.9", lw=0, zorder=0)
@@ -312,7 +312,7 @@ def picture(report: dict[str, Any], path: Path) -> None:
 
 def _roofs(ax: Any, costs: dict[str, float], width: int) -> None:
     """The largest rate of operations for a number of operations per byte."""
-    intensity = np.geomspace(0.2, 1e4, 400)
+    intensity = np.geomspace(0.2, 1e5, 400)
     top = width / costs["vector rate mix"]
     new = min(costs["write new memory"], costs["stream new memory"])
     for name, cost in (("L2 cache", costs["write L2"]), ("new memory", new)):

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import platform
 import subprocess
 import sys
 import textwrap
@@ -12,7 +13,8 @@ import pytest
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 pytest.importorskip("matplotlib")
 pytestmark = pytest.mark.skipif(
-    sys.platform != "linux", reason="the code with probes requires Linux and x86-64"
+    (sys.platform, platform.machine()) != ("linux", "x86_64"),
+    reason="the code with probes requires Linux and x86-64",
 )
 
 
