@@ -1,7 +1,9 @@
 """Forces of `dvi.forces` from the tables [[force]] of a TOML file."""
 
 import inspect
+import operator
 from collections.abc import Mapping
+from functools import reduce
 from typing import Any
 
 from dvi_jax.systems import Problem, forces
@@ -48,7 +50,7 @@ def add_forces(
         with as_input_error(key, f"parameters of {name}: {one_of(names)}"):
             terms.append(CLASSES[name](**options))
     with as_input_error("force", "a system whose args are a table"):
-        return sum(terms[1:], terms[0]).add_to(problem, args=own or None)
+        return reduce(operator.add, terms).add_to(problem, args=own or None)
 
 
 def _numbers(key: str, text: str) -> Any:
