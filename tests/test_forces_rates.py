@@ -74,7 +74,7 @@ def test_the_potential_with_the_precession_of_mercury():
         q = sol.observed.qs[-1]
         return jnp.arctan2(q[1], q[0])
 
-    light = LIGHT * np.array([1.0, 1e-2])  # the second: in which the second order is seen
+    light = LIGHT * np.array([1.0, 1e-2])  # the second: where the second order is large
     exact = 2 * np.pi * ((1 - 6 * SUN / (light**2 * p)) ** -0.5 - 1)
     np.testing.assert_allclose(angle(jnp.asarray(light)), turns * exact, rtol=0, atol=1e-11)
     assert abs(exact[1] / (6 * np.pi * SUN / (light[1] ** 2 * p)) - 1) > 1e-3
