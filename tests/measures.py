@@ -38,11 +38,11 @@ PACKAGES = ("dvi_jax", "lanewise", "dvi_jax_cli")
 LONGEST_FILE, MOST_PARAMETERS = 450, 9
 
 LIMITS: dict[str, float] = {
-    "lines of the core": 17_520,
+    "lines of the core": 17_630,
     "lines of the questions": 22_475,
-    "lines of the leaves": 25_480,
-    "lines of lanewise": 12_760,
-    "lines of the command line": 5_669,
+    "lines of the leaves": 25_515,
+    "lines of lanewise": 12_980,
+    "lines of the command line": 5_765,
     "raise statements": 671,
     "characters of error text": 45_000,
     "functions with more than 9 parameters": 2,

@@ -149,7 +149,7 @@ def _on_time(*operands: Array) -> list[Array]:
     return lanewise.with_derivative(lambda *operands: list(operands[:5]), _slope, operands)
 
 
-def _slope(operands: list[Array], changes: dict[int, Array]) -> list[Array]:
+def _slope(operands: list[Array], changes: dict[int, Array]) -> list[Array | None]:
     """∂G_n/∂X = G_{n−1} with G₋₁ = −β G₁, ∂G_n/∂β = (n G_{n+2} − X G_{n+1})/2; dX by t(X) = h."""
     X, *functions = _on_time(*operands)
     g, orbit = _G(*functions), _Orbit(*operands[5:9])

@@ -21,12 +21,15 @@ def add_forces(
 ) -> Problem:
     """The problem with the forces of the tables; `args`: those of the file, in which a parameter
     that is "args.NAME" is a key. **Raises** `InputError`."""
-    own: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
 
     def value_of(key: str, value: Any) -> Any:
         if isinstance(value, dict):  # of harmonics: "2" is a degree, "2,1" a degree and an order
             parts = {f"{key}.{index}": index for index in value}
-            return {_numbers(at, index): value_of(at, value[index]) for at, index in parts.items()}
+            return {
+                _numbers(place, index): value_of(place, value[index])
+                for place, index in parts.items()
+            }
         if isinstance(value, list):
             return tuple(value_of(key, part) for part in value)
         if not isinstance(value, str):
@@ -36,7 +39,7 @@ def add_forces(
         prefix, _, name = value.partition(".")
         rule = 'numbers, "args.NAME" with a key NAME of [args], or "file.py:name"'
         require(prefix == "args" and name in args, key, describe(value), rule)
-        own[name] = args[name]
+        parameters[name] = args[name]
         return lambda args: args[name]
 
     terms: list[Any] = []
@@ -52,7 +55,7 @@ def add_forces(
         with as_input_error(key, f"parameters of {name}: {one_of(names)}"):
             terms.append(CLASSES[name](**options))
     with as_input_error("force", "a system whose args are a table"):
-        return functools.reduce(operator.add, terms).add_to(problem, args=own or None)
+        return functools.reduce(operator.add, terms).add_to(problem, args=parameters or None)
 
 
 def _numbers(key: str, text: str) -> Any:

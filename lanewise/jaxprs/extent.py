@@ -75,15 +75,15 @@ def operation_count(jaxpr: Any) -> int:
 def calls_of_marked(jaxpr: Any) -> dict[Any, int]:
     """The jaxprs of functions marked by `once`, and in how many places they are called."""
     places: dict[Any, int] = {}
-    seen: set[Any] = set()
+    visits: set[Any] = set()
 
     def count(jaxpr: Any) -> None:
         for eqn in jaxpr.eqns:
             for function in (f.jaxpr for f in _evaluated(eqn)):
                 if is_once(eqn):
                     places[function] = places.get(function, 0) + 1
-                if function not in seen:
-                    seen.add(function)
+                if function not in visits:
+                    visits.add(function)
                     count(function)
 
     count(jaxpr)

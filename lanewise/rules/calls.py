@@ -28,26 +28,28 @@ class _Function:
 
 def _call(evaluator: Evaluator, eqn: Any, values: Values, places: list) -> Values:
     (body,) = bodies(eqn)
-    is_long = any(v.entries is None and v.size > SMALL for v in values)
+    is_long = any(value.entries is None and value.size > SMALL for value in values)
     if is_long or not is_once(eqn):
         return evaluator.evaluate(body, values, places)
     # In a function of its own, no product is contracted with a sum outside: the same everywhere,
     # so that another call, of an observable for example, changes no bit of this one.
-    inputs = [evaluator.value([*evaluator.entries(v).flat], v) for v in values]
+    inputs = [evaluator.value([*evaluator.entries(value).flat], value) for value in values]
     for new, old in zip(inputs, values, strict=True):
         new.is_tangent = old.is_tangent
     if evaluator.module.calls.get(body.jaxpr, 1) == 1 or evaluator.module.platform != "cpu":
-        outs = evaluator.evaluate(body, [evaluator.opaque(v) for v in inputs])
-        return [evaluator.opaque(v) for v in outs]
+        outs = evaluator.evaluate(body, [evaluator.opaque(value) for value in inputs])
+        return [evaluator.opaque(value) for value in outs]
     # Known numbers are a part of the function: products with zeros and ones are not written.
-    numbers = [x for v in inputs for x in evaluator.entries(v).flat]
-    kinds = tuple((x.dtype, x.vec) if x.value is None else x.key for x in numbers)
-    key = body.jaxpr, kinds, tuple(v.is_tangent for v in inputs)
+    numbers = [number for value in inputs for number in evaluator.entries(value).flat]
+    kinds = tuple(
+        (number.dtype, number.vec) if number.value is None else number.key for number in numbers
+    )
+    key = body.jaxpr, kinds, tuple(value.is_tangent for value in inputs)
     written = evaluator.module.written_functions
     if key not in written:
         written[key] = _write(evaluator.module, body, inputs)
     results = iter(_results(evaluator, written[key], numbers))
-    avals = [v.aval for v in eqn.outvars]
+    avals = [value.aval for value in eqn.outvars]
     return [evaluator.value([next(results) for _ in range(a.size)], a) for a in avals]
 
 
@@ -59,25 +61,25 @@ def _write(module: Module, body: ClosedJaxpr, inputs: Values) -> _Function:
     b, evaluator = inner.b, Evaluator(inner)
     parameters: list[str] = []
 
-    def argument(x: Num) -> Num:
-        if x.value is not None:
-            return x
+    def argument(number: Num) -> Num:
+        if number.value is not None:
+            return number
         name = f"%x{len(parameters)}"
-        parameters.append(f"{b.type(x.dtype, x.vec)} {name}")
-        return b.number([name], x.dtype, x.vec)
+        parameters.append(f"{b.type(number.dtype, number.vec)} {name}")
+        return b.number([name], number.dtype, number.vec)
 
     arguments = []
     for value in inputs:
         assert value.entries is not None
-        entries = objects([argument(x) for x in value.entries.flat], value.shape)
+        entries = objects([argument(number) for number in value.entries.flat], value.shape)
         arguments.append(Value(value.shape, value.dtype, entries))
         arguments[-1].is_tangent = value.is_tangent
     outs = evaluator.evaluate(body, arguments)
-    results = [x for out in outs for x in evaluator.entries(out).flat]
+    results = [number for out in outs for number in evaluator.entries(out).flat]
     # In memory, not in a structure: its type would be written again with each of its numbers.
-    for k, x in enumerate(x for x in results if x.value is None):
-        place = b.pointer("i8", "%scratch", inner.scratch_bytes + k * _SIZE * b.W)
-        b.emit(f"store {b.type(x.dtype, x.vec)} {x.names[0]}, ptr {place}")
+    for row, number in enumerate(number for number in results if number.value is None):
+        place = b.pointer("i8", "%scratch", inner.scratch_bytes + row * _SIZE * b.W)
+        b.emit(f"store {b.type(number.dtype, number.vec)} {number.names[0]}, ptr {place}")
     parameters += ["ptr %scratch", *(f"i64 %par{i}" for i in range(len(inner.values)))]
     module.declarations |= b.declarations
     head = f"define internal void {symbol}({', '.join(parameters)}) noinline {{\nentry:"
@@ -88,25 +90,29 @@ def _write(module: Module, body: ClosedJaxpr, inputs: Values) -> _Function:
 def _results(evaluator: Evaluator, function: _Function, numbers: Sequence[Num]) -> list[Num]:
     """The results of a call, one for each vector of a block."""
     b, module = evaluator.b, evaluator.module
-    moving = [x for x in function.results if x.value is None]
+    moving = [number for number in function.results if number.value is None]
     size = function.scratch_bytes // _SIZE + len(moving) * b.W
     memory = module.scratch((size,), "float64", False).base[0]
     counts = [f"i64 {module.parameter(n).names[0]}" for n in function.values]
     # One vector after the other: a long function has enough independent operations.
     names: list[list[str]] = [[] for _ in moving]
-    for u in range(b.U if any(x.vec for x in numbers) else 1):
+    for u in range(b.U if any(number.vec for number in numbers) else 1):
         arguments = [
-            f"{b.type(x.dtype, x.vec)} {b.ref(x, u, x.vec)}" for x in numbers if x.value is None
+            f"{b.type(number.dtype, number.vec)} {b.ref(number, u, number.vec)}"
+            for number in numbers
+            if number.value is None
         ]
         b.emit(f"call void {function.symbol}({', '.join([*arguments, f'ptr {memory}', *counts])})")
         # Read before the next call, which writes to the same memory.
-        for k, x in enumerate(moving):
-            place = b.pointer("i8", memory, function.scratch_bytes + k * _SIZE * b.W)
-            names[k].append(b.new(f"load {b.type(x.dtype, x.vec)}, ptr {place}"))
+        for row, number in enumerate(moving):
+            place = b.pointer("i8", memory, function.scratch_bytes + row * _SIZE * b.W)
+            names[row].append(b.new(f"load {b.type(number.dtype, number.vec)}, ptr {place}"))
     b.operations += function.operations
     pairs = zip(names, moving, strict=True)
-    news = iter([b.number(n if x.vec else n[:1], x.dtype, x.vec) for n, x in pairs])
-    return [x if x.value is not None else next(news) for x in function.results]
+    news = iter(
+        [b.number(n if number.vec else n[:1], number.dtype, number.vec) for n, number in pairs]
+    )
+    return [number if number.value is not None else next(news) for number in function.results]
 
 
 RULES |= dict.fromkeys(CALLS, _call)

@@ -110,9 +110,9 @@ def to_bodies(
     ```
     """
     instance("elements", elements, (*_KINDS.values(),), "elements, such as dvi.elements.Keplerian")
-    values = [x if isinstance(x, np.ndarray) else jnp.asarray(x) for x in elements]
-    shape = jnp.broadcast_shapes(*(x.shape for x in values))
-    elements = type(elements)(*(broadcast(x, shape) for x in values))
+    values = [value if isinstance(value, np.ndarray) else jnp.asarray(value) for value in elements]
+    shape = jnp.broadcast_shapes(*(value.shape for value in values))
+    elements = type(elements)(*(broadcast(value, shape) for value in values))
     array("the elements", elements[0], ("bodies − 1",), integers=True)
     all_masses, scale, G = _masses(masses, len(elements[0]) + 1, G)
     coordinates = _frame(frame)(all_masses)

@@ -28,7 +28,7 @@ program = functools.partial(jax.jit, inline=True)
 def _of_state(compute: Callable) -> Any:
     """The elements of a state. **Raises** `TypeError` for other than real numbers, `ValueError` for
     another shape, or a known μ that is not positive."""
-    compiled: Any = program(compute, static_argnums=0)
+    conversion: Any = program(compute, static_argnums=0)
 
     @functools.wraps(compute)
     def from_state(cls, q: Any, v: Any, mu: Any):
@@ -36,7 +36,7 @@ def _of_state(compute: Callable) -> Any:
         one_of("the last axis of q", q.shape[-1:], ((2,), (3,)))
         array("v", v, q.shape)
         _positive("mu", array("mu", mu, *{(), q.shape[:-1]}, empty=True))
-        return compiled(cls, q, v, mu)
+        return conversion(cls, q, v, mu)
 
     return from_state
 
