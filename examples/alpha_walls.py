@@ -80,6 +80,7 @@ def draw(wall, hits, power, periods):
           f"{blocks(watts).flat[load.argmax()] / power:.0f} particles")  # fmt: skip
     print(f"mean of the wall {watts.sum() / wall.areas.sum() / 1e3:.1f} kW/m²")
     figure, axis = plt.subplots(figsize=(7.5, 3.6), layout="constrained")
+    axis.grid(False)
     image = axis.imshow(load / 1e6, origin="lower", extent=(0, 360 / periods, 0, 360),
                         aspect="auto", cmap="inferno")  # fmt: skip
     axis.set(xlabel="ζ within one period [degrees]", ylabel="θ [degrees]", yticks=range(0, 361, 90))

@@ -171,7 +171,7 @@ def test_derivatives_of_states_are_the_inverse(kind):
     forth, back = map(np.asarray, both)
     # The derivatives have rounding errors, by which the product differs.
     rounding = np.finfo(float).eps * np.abs(forth) @ np.abs(back)
-    assert np.max(np.abs(forth @ back - np.eye(6)) / (rounding + 1e-15)) < 5
+    assert np.max(np.abs(forth @ back - np.eye(6)) / (rounding + 1e-15)) < 20
 
 
 def test_regular_elements_have_derivatives_on_a_circle_in_the_plane():

@@ -42,6 +42,9 @@ def carried_over(
         if x.serial < first.first_serial:  # computed before the loop, for another purpose
             continue
         form = first.key(x)
+        # Not what is equal in all rounds: it may be computed before the loop.
+        if form == second.key(x):
+            continue
         # A number that is the same on all trajectories is cheap.
         if form in ends and _is_costly(x) and x.vec and x.write and ends[form].vec:
             pairs.append((x, ends[form]))
