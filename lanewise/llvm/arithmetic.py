@@ -53,7 +53,11 @@ class Operations(Finiteness):
             return self._fold(np.multiply, a, b)
         for x, y in ((a, b), (b, a)):
             if factors := self._joined_factors(x, y):
-                return self.mul(*factors)
+                product = self.mul(*factors)
+                # With a power of two c, c·x has the rounding of x, which a sum must not take away:
+                # alone and in a batch not the same numbers are known before the loop.
+                is_rounded = x.value is not None and is_power_of_two(x.value)
+                return self.opaque(product) if is_rounded else product
         for x, y in ((a, b), (b, a)):
             # Not for every zero: 0·∞ and 0·NaN are NaN, as in IEEE 754.
             if x.structural and x.is_const(0):
